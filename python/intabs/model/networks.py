@@ -1,0 +1,126 @@
+"""The networks: encoders q^r, q^e and the policy pi. The same shapes and tensor names are read by the C++ room `nn`."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+LATENT = 8  # of each of z^r, z^e
+AGENT_DIM = 7  # joints, gripper
+OBJECTS = 4
+OBJECT_DIM = 10  # p_GO, two columns of R_GO, valid
+ENVIRONMENT_DIM = OBJECTS * OBJECT_DIM
+STATE_DIM = AGENT_DIM + ENVIRONMENT_DIM
+AGENT_ACTION_DIM = 7  # joint steps, gripper
+ENVIRONMENT_ACTION_DIM = OBJECTS * 6
+
+
+class Recurrent(nn.Module):
+    """Linear input layer, stacked LSTM with optional residual connections, named linear heads.
+
+    Residual: layer l >= 1 hands on h_l + x_l; its own recurrent state stays h_l.
+    Bidirectional: one stack forwards, one backwards; heads see [h at the end, h' at the start] of the last layers.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        layers: int,
+        hidden: int,
+        heads: dict[str, int],
+        input_linear: int = 0,
+        residual: bool = False,
+        bidirectional: bool = False,
+    ):
+        super().__init__()
+        self.spec = {
+            "input": inputs,
+            "input_linear": input_linear,
+            "layers": layers,
+            "hidden": hidden,
+            "residual": residual,
+            "bidirectional": bidirectional,
+            "heads": dict(heads),
+        }
+        self.residual = residual
+        self.bidirectional = bidirectional
+        self.input = nn.Linear(inputs, input_linear) if input_linear else nn.Identity()
+        first = input_linear or inputs
+        directions = 2 if bidirectional else 1
+        self.stacks = nn.ModuleList(
+            nn.ModuleList(nn.LSTM(first if i == 0 else hidden, hidden, batch_first=True) for i in range(layers))
+            for _ in range(directions)
+        )
+        self.heads = nn.ModuleDict({k: nn.Linear(hidden * directions, n) for k, n in heads.items()})
+        for stack in self.stacks:
+            for lstm in stack:
+                for k in range(4):
+                    nn.init.orthogonal_(lstm.weight_hh_l0.data[k * hidden : (k + 1) * hidden])
+                nn.init.zeros_(lstm.bias_hh_l0)
+                nn.init.zeros_(lstm.bias_ih_l0)
+                lstm.bias_ih_l0.data[hidden : 2 * hidden] = 1.0  # forget gate open at the start
+
+    def _run(self, stack: nn.ModuleList, x: Tensor) -> Tensor:
+        for i, lstm in enumerate(stack):
+            h, _ = lstm(x)
+            x = h + x if self.residual and i > 0 else h
+        return x
+
+    def forward(self, x: Tensor) -> dict[str, Tensor]:
+        """x (B, T, inputs). Causal: heads at every tick, (B, T, n). Bidirectional: one value a sequence, (B, n)."""
+        x = self.input(x)
+        if not self.bidirectional:
+            y = self._run(self.stacks[0], x)
+        else:
+            forwards = self._run(self.stacks[0], x)[:, -1]
+            backwards = self._run(self.stacks[1], x.flip(1))[:, -1]
+            y = torch.cat([forwards, backwards], dim=-1)
+        return {k: head(y) for k, head in self.heads.items()}
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Names and values as the C++ side reads them."""
+        out = {}
+        if isinstance(self.input, nn.Linear):
+            out["input.weight"], out["input.bias"] = self.input.weight, self.input.bias
+        for stack, suffix in zip(self.stacks, ("", "_reverse")):
+            for i, lstm in enumerate(stack):
+                for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
+                    out[f"lstm.{i}.{name}{suffix}"] = getattr(lstm, f"{name}_l0")
+        for name, head in self.heads.items():
+            out[f"heads.{name}.weight"], out[f"heads.{name}.bias"] = head.weight, head.bias
+        return {k: v.detach().contiguous() for k, v in out.items()}
+
+
+class InteractionAbstractions(nn.Module):
+    """q^r(z^r | tau^r), q^e(z^e | tau^e) and pi(a^r, a^e | s, z), z = [z^r, z^e]. All inputs are normalised."""
+
+    def __init__(self, config: dict):
+        super().__init__()
+        gaussian = {"mean": LATENT, "log_std": LATENT}
+        self.q_agent = Recurrent(
+            AGENT_DIM + AGENT_ACTION_DIM, heads=gaussian, bidirectional=True, **config["encoder"]
+        )
+        self.q_environment = Recurrent(
+            ENVIRONMENT_DIM + ENVIRONMENT_ACTION_DIM, heads=gaussian, bidirectional=True, **config["encoder"]
+        )
+        self.pi = Recurrent(
+            STATE_DIM + 2 * LATENT,
+            heads={"agent": AGENT_ACTION_DIM, "environment": ENVIRONMENT_ACTION_DIM},
+            **config["pi"],
+        )
+
+    def encode(self, state: Tensor, agent_action: Tensor, environment_action: Tensor) -> tuple[Tensor, Tensor]:
+        """Segments (B, T, .) -> mean and log standard deviation of z, (B, 16)."""
+        agent = self.q_agent(torch.cat([state[..., :AGENT_DIM], agent_action], -1))
+        environment = self.q_environment(torch.cat([state[..., AGENT_DIM:], environment_action], -1))
+        mean = torch.cat([agent["mean"], environment["mean"]], -1)
+        log_std = torch.cat([agent["log_std"], environment["log_std"]], -1).clamp(-6, 2)
+        return mean, log_std
+
+    def act(self, state: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
+        """state (B, T, 47), z (B, 16) held over the segment -> a^r (B, T, 7), a^e (B, T, 24); hidden state from zero."""
+        y = self.pi(torch.cat([state, z[:, None].expand(-1, state.shape[1], -1)], -1))
+        return y["agent"], y["environment"]
+
+    def networks(self) -> dict[str, Recurrent]:
+        return {"pi": self.pi, "q_agent": self.q_agent, "q_environment": self.q_environment}

@@ -1,0 +1,136 @@
+"""Checkpoint -> models/weights/NAME: weights.safetensors, manifest.json with golden vectors, plans/<task>.json.
+
+The C++ side loads what was written before the export counts as done, and must give the golden outputs.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from intabs import _core
+from intabs.data.demos import Demo, load_demos
+from intabs.data.features import trajectory
+from intabs.model.networks import InteractionAbstractions
+from intabs.train.trainer import default_arm, load_model
+
+SCHEMA = 1
+GOLDEN_TICKS = 40
+TOLERANCE = 1e-5
+
+
+def encode_demo(model: InteractionAbstractions, normalizer, demo: Demo, cut: int) -> np.ndarray:
+    """The skills of a demonstration by a fixed cut: (n, 16) means of z. A rest of half a cut or more is a skill of its own."""
+    t = normalizer.normalize(trajectory(demo, default_arm()))
+    length = len(t.state)
+    starts = list(range(0, length - cut // 2, cut))
+    rows = []
+    with torch.no_grad():
+        for a in starts:
+            b = min(a + cut, length)
+            mean, _ = model.encode(
+                *(torch.from_numpy(np.ascontiguousarray(x[None, a:b], "f4"))
+                  for x in (t.state, t.agent_action, t.environment_action))
+            )
+            rows.append(mean[0].numpy())
+    return np.stack(rows)
+
+
+def typical_demo(demos: list[Demo]) -> int:
+    """The demonstration whose objects start nearest to the average place, among those of about average length."""
+    first = np.array([d.object_pose[np.argmax(d.object_valid.all(1)), :, :3].ravel() for d in demos])
+    lengths = np.array([len(d) for d in demos])
+    near_length = np.abs(lengths - np.median(lengths)) <= 0.15 * np.median(lengths)
+    distance = np.linalg.norm(first - first.mean(0), axis=1)
+    return int(np.argmin(np.where(near_length, distance, np.inf)))
+
+
+def make_plan(model, normalizer, demo: Demo, cut: int, source: str) -> dict:
+    z = encode_demo(model, normalizer, demo, cut)
+    return {
+        "task": demo.attrs["task"],
+        "source_demo": source,
+        "skills": [{"z": [float(v) for v in row], "min_ticks": cut, "max_ticks": cut} for row in z],
+    }
+
+
+def export(run: Path | str, out: Path | str) -> dict:
+    """Returns {sha256, tensors, max_abs_error}; raises ValueError if C++ and torch disagree by more than 1e-5."""
+    from safetensors.torch import save_file
+
+    model, normalizer, checkpoint = load_model(run)
+    out = Path(out)
+    (out / "plans").mkdir(parents=True, exist_ok=True)
+    tensors = {
+        f"{net}.{name}": value.float()
+        for net, module in model.networks().items()
+        for name, value in module.tensors().items()
+    }
+    weights = out / "weights.safetensors"
+    save_file(tensors, str(weights))
+    sha256 = hashlib.sha256(weights.read_bytes()).hexdigest()
+
+    golden = {}
+    rng = np.random.default_rng(0)
+    for net, module in model.networks().items():
+        x = rng.normal(size=(GOLDEN_TICKS, module.spec["input"])).astype("f4")
+        with torch.no_grad():
+            y = module(torch.from_numpy(x)[None])
+        golden[net] = {
+            "input": x.tolist(),
+            "heads": {k: v[0].numpy().tolist() for k, v in y.items()},
+        }
+    (out / "golden.json").write_text(json.dumps(golden))
+
+    cut = int(round(sum(checkpoint["config"]["objective"]["segment"]) / 2))
+    manifest = {
+        "schema": SCHEMA,
+        "weights_sha256": sha256,
+        "networks": {net: module.spec for net, module in model.networks().items()},
+        "state_layout": "gripper-relative/1",  # skills/state.h
+        "normalizer": normalizer.to_dict(),
+        "policy_period_us": 40000,
+        "training": {
+            "data_sha256": checkpoint["data"]["sha256"],
+            "config": checkpoint["config"],
+            "seed": checkpoint["seed"],
+            "steps": checkpoint["step"],
+            "code_version": checkpoint["code_version"],
+        },
+    }
+    (out / "manifest.json").write_text(json.dumps(manifest, indent=1))
+
+    demos, _ = load_demos(checkpoint["data"]["path"], "train")
+    for task in sorted({d.attrs["task"] for d in demos}):
+        of_task = [d for d in demos if d.attrs["task"] == task]
+        k = typical_demo(of_task)
+        plan = make_plan(model, normalizer, of_task[k], cut, f"seed {of_task[k].attrs.get('seed')}")
+        (out / "plans" / f"{task}.json").write_text(json.dumps(plan, indent=1))
+
+    error = verify(out)
+    if not error <= TOLERANCE:
+        raise ValueError(f"{out}: the C++ network differs from torch by {error:.2e}, more than {TOLERANCE:.0e}")
+    return {"sha256": sha256, "tensors": len(tensors), "max_abs_error": error}
+
+
+def verify(weights: Path | str) -> float:
+    """Loads the weights in C++ and replays the golden inputs; largest absolute difference."""
+    weights = Path(weights)
+    golden = json.loads((weights / "golden.json").read_text())
+    worst = 0.0
+    for net, g in golden.items():
+        network = _core.Network.load(str(weights), net)
+        x = np.asarray(g["input"], "f4")
+        for head, want in g["heads"].items():
+            want = np.asarray(want, "f4")
+            if want.ndim == 1:  # an encoder: one value a sequence
+                got = network.encode_final(x)[head]
+            else:
+                network.reset()
+                got = np.stack([network.step(row)[head] for row in x])
+            worst = max(worst, float(np.abs(got - want).max()))
+    return worst
