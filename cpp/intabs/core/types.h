@@ -12,7 +12,8 @@ namespace intabs {
 
 inline constexpr int kNumJoints = 6;
 inline constexpr int kMaxObjects = 4;
-inline constexpr int kMaxTags = 10;   // a TAG_DETECTIONS message
+inline constexpr int kMaxTags = 10;     // a TAG_DETECTIONS message
+inline constexpr int kMaxCameras = 4;   // a PERCEPTION_STATUS message
 inline constexpr int kLatentDim = 16;  // z = [z_agent(8), z_environment(8)]
 
 inline constexpr int64_t kDriverPeriodUs = 4000;   // 250 Hz
@@ -134,5 +135,16 @@ struct PlantTruth {
   bool success = false;
   uint64_t state_hash = 0;
 };
+
+// Poses as control takes them under `--perception truth`.
+inline ObjectPoses PosesFromTruth(const PlantTruth& truth) {
+  ObjectPoses poses;
+  poses.utime = truth.utime;
+  poses.exposure_utime = truth.utime;
+  poses.seq = truth.seq;
+  poses.frame_seq = truth.frame_seq;
+  poses.objects = truth.objects;
+  return poses;
+}
 
 }  // namespace intabs

@@ -17,6 +17,9 @@ struct Observation {
   std::array<TrackedObject, kMaxObjects> objects;
 };
 
+// Name of this layout; weights carry the one they were trained with.
+inline constexpr char kStateLayout[] = "gripper-relative/1";
+
 inline constexpr int kAgentDim = kNumJoints + 1;           // q, gripper (+1 closed, -1 open)
 inline constexpr int kObjectDim = 10;                      // an object: p_GO, first two columns of R_GO, valid
 inline constexpr int kEnvironmentDim = kObjectDim * kMaxObjects;

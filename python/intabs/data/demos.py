@@ -17,6 +17,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from intabs.errors import UserError
 import h5py
 import numpy as np
 
@@ -97,19 +98,19 @@ def load_demos(path: Path | str, mask: str | None = None) -> tuple[list[Demo], d
     """All demonstrations, or those of `mask` (train, valid). Raises ValueError with one line on a file that is not ours."""
     path = Path(path)
     if not path.exists():
-        raise ValueError(f"{path}: no such file; make one with `intabs collect --out {path}`")
+        raise UserError(f"{path}: no such file; make one with `intabs collect --out {path}`")
     try:
         f = h5py.File(path, "r")
     except OSError as e:
-        raise ValueError(f"{path}: not an HDF5 file, or cut off ({e})") from None
+        raise UserError(f"{path}: not an HDF5 file, or cut off ({e})") from None
     with f:
         if "data" not in f or not any(k.startswith("demo_") for k in f["data"]):
-            raise ValueError(f"{path}: has no group data/demo_*; `intabs data info` says what a file holds")
+            raise UserError(f"{path}: has no group data/demo_*; `intabs data info` says what a file holds")
         data = f["data"]
         names = sorted((k for k in data if k.startswith("demo_")), key=lambda s: int(s.split("_")[1]))
         if mask is not None:
             if f"mask/{mask}" not in f:
-                raise ValueError(f"{path}: has no mask/{mask}")
+                raise UserError(f"{path}: has no mask/{mask}")
             keep = {n.decode() for n in f[f"mask/{mask}"][:]}
             names = [n for n in names if n in keep]
         demos = []
@@ -117,7 +118,7 @@ def load_demos(path: Path | str, mask: str | None = None) -> tuple[list[Demo], d
             try:
                 demos.append(_read_demo(data[name]))
             except KeyError as e:
-                raise ValueError(f"{path}: data/{name} lacks a field ({e.args[0]})") from None
+                raise UserError(f"{path}: data/{name} lacks a field ({e.args[0]})") from None
         attrs = {k: _plain(v) for k, v in data.attrs.items()}
     return demos, attrs
 

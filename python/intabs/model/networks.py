@@ -19,7 +19,7 @@ class Recurrent(nn.Module):
     """Linear input layer, stacked LSTM with optional residual connections, named linear heads.
 
     Residual: layer l >= 1 hands on h_l + x_l; its own recurrent state stays h_l.
-    Bidirectional: one stack forwards, one backwards; heads see [h at the end, h' at the start] of the last layers.
+    Bidirectional: heads see [forward half at the last tick, backward half at the first] of the last layer.
     """
 
     def __init__(
@@ -46,46 +46,42 @@ class Recurrent(nn.Module):
         self.bidirectional = bidirectional
         self.input = nn.Linear(inputs, input_linear) if input_linear else nn.Identity()
         first = input_linear or inputs
-        directions = 2 if bidirectional else 1
-        self.stacks = nn.ModuleList(
-            nn.ModuleList(nn.LSTM(first if i == 0 else hidden, hidden, batch_first=True) for i in range(layers))
-            for _ in range(directions)
+        width = hidden * (2 if bidirectional else 1)
+        self.lstm = nn.ModuleList(
+            nn.LSTM(first if i == 0 else width, hidden, batch_first=True, bidirectional=bidirectional)
+            for i in range(layers)
         )
-        self.heads = nn.ModuleDict({k: nn.Linear(hidden * directions, n) for k, n in heads.items()})
-        for stack in self.stacks:
-            for lstm in stack:
+        self.heads = nn.ModuleDict({k: nn.Linear(width, n) for k, n in heads.items()})
+        for lstm in self.lstm:
+            for suffix in ("", "_reverse") if bidirectional else ("",):
+                weight_hh = getattr(lstm, f"weight_hh_l0{suffix}")
                 for k in range(4):
-                    nn.init.orthogonal_(lstm.weight_hh_l0.data[k * hidden : (k + 1) * hidden])
-                nn.init.zeros_(lstm.bias_hh_l0)
-                nn.init.zeros_(lstm.bias_ih_l0)
-                lstm.bias_ih_l0.data[hidden : 2 * hidden] = 1.0  # forget gate open at the start
-
-    def _run(self, stack: nn.ModuleList, x: Tensor) -> Tensor:
-        for i, lstm in enumerate(stack):
-            h, _ = lstm(x)
-            x = h + x if self.residual and i > 0 else h
-        return x
+                    nn.init.orthogonal_(weight_hh.data[k * hidden : (k + 1) * hidden])
+                nn.init.zeros_(getattr(lstm, f"bias_hh_l0{suffix}"))
+                bias = getattr(lstm, f"bias_ih_l0{suffix}")
+                nn.init.zeros_(bias)
+                bias.data[hidden : 2 * hidden] = 1.0  # forget gate open at the start
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
         """x (B, T, inputs). Causal: heads at every tick, (B, T, n). Bidirectional: one value a sequence, (B, n)."""
         x = self.input(x)
-        if not self.bidirectional:
-            y = self._run(self.stacks[0], x)
-        else:
-            forwards = self._run(self.stacks[0], x)[:, -1]
-            backwards = self._run(self.stacks[1], x.flip(1))[:, -1]
-            y = torch.cat([forwards, backwards], dim=-1)
-        return {k: head(y) for k, head in self.heads.items()}
+        for i, lstm in enumerate(self.lstm):
+            h, _ = lstm(x)
+            x = h + x if self.residual and i > 0 else h
+        if self.bidirectional:
+            hidden = self.spec["hidden"]
+            x = torch.cat([x[:, -1, :hidden], x[:, 0, hidden:]], dim=-1)
+        return {k: head(x) for k, head in self.heads.items()}
 
     def tensors(self) -> dict[str, Tensor]:
         """Names and values as the C++ side reads them."""
         out = {}
         if isinstance(self.input, nn.Linear):
             out["input.weight"], out["input.bias"] = self.input.weight, self.input.bias
-        for stack, suffix in zip(self.stacks, ("", "_reverse")):
-            for i, lstm in enumerate(stack):
+        for i, lstm in enumerate(self.lstm):
+            for suffix in ("", "_reverse") if self.bidirectional else ("",):
                 for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
-                    out[f"lstm.{i}.{name}{suffix}"] = getattr(lstm, f"{name}_l0")
+                    out[f"lstm.{i}.{name}{suffix}"] = getattr(lstm, f"{name}_l0{suffix}")
         for name, head in self.heads.items():
             out[f"heads.{name}.weight"], out[f"heads.{name}.bias"] = head.weight, head.bias
         return {k: v.detach().contiguous() for k, v in out.items()}

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from intabs.errors import UserError
 from intabs import _core
 from intabs.data.demos import Demo, load_demos
 from intabs.data.features import trajectory
@@ -88,8 +89,8 @@ def export(run: Path | str, out: Path | str) -> dict:
 
     cut = int(round(sum(checkpoint["config"]["objective"]["segment"]) / 2))
     manifest = {
-        "schema": SCHEMA,
-        "weights_sha256": sha256,
+        "schema_version": SCHEMA,
+        "sha256": sha256,
         "networks": {net: module.spec for net, module in model.networks().items()},
         "state_layout": "gripper-relative/1",  # skills/state.h
         "normalizer": normalizer.to_dict(),
@@ -113,7 +114,7 @@ def export(run: Path | str, out: Path | str) -> dict:
 
     error = verify(out)
     if not error <= TOLERANCE:
-        raise ValueError(f"{out}: the C++ network differs from torch by {error:.2e}, more than {TOLERANCE:.0e}")
+        raise UserError(f"{out}: the C++ network differs from torch by {error:.2e}, more than {TOLERANCE:.0e}")
     return {"sha256": sha256, "tensors": len(tensors), "max_abs_error": error}
 
 

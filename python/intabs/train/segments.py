@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from intabs.errors import UserError
 from intabs.data.features import Normalizer, Trajectory
 from intabs.model.networks import AGENT_DIM, OBJECT_DIM, OBJECTS
 
@@ -15,7 +16,7 @@ class SegmentSampler:
     def __init__(self, trajectories: list[Trajectory], length: tuple[int, int], device: str):
         too_short = [i for i, t in enumerate(trajectories) if len(t.state) < length[1]]
         if too_short:
-            raise ValueError(f"demonstration {too_short[0]} is shorter than a segment of {length[1]} ticks")
+            raise UserError(f"demonstration {too_short[0]} is shorter than a segment of {length[1]} ticks")
         self.length = length
         self.device = device
         self.state = torch.from_numpy(np.concatenate([t.state for t in trajectories])).to(device)

@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 import yaml
 
+from intabs.errors import UserError
 from intabs import __version__, _core
 from intabs.data.demos import load_demos
 from intabs.data.features import Normalizer, trajectory
@@ -30,7 +31,7 @@ def load_config(name_or_file: str, overrides: list[str]) -> dict:
         path = CONFIGS / f"{name_or_file}.yaml"
     if not path.exists():
         known = ", ".join(sorted(p.stem for p in CONFIGS.glob("*.yaml")))
-        raise ValueError(f"no config {name_or_file!r}; known: {known}, or the path of a .yaml file")
+        raise UserError(f"no config {name_or_file!r}; known: {known}, or the path of a .yaml file")
     config = yaml.safe_load(path.read_text())
     for item in overrides:
         key, sep, value = item.partition("=")
@@ -39,7 +40,7 @@ def load_config(name_or_file: str, overrides: list[str]) -> dict:
         for group in groups:
             node = node.get(group) if isinstance(node, dict) else None
         if not sep or not isinstance(node, dict) or last not in node:
-            raise ValueError(f"--set {item}: no such setting; write group.name=value, e.g. train.steps=1000")
+            raise UserError(f"--set {item}: no such setting; write group.name=value, e.g. train.steps=1000")
         node[last] = yaml.safe_load(value)
     return config
 
@@ -130,7 +131,7 @@ class Trainer:
             batch = self.sampler.sample(self.config["train"]["batch"], self.generator)
             loss, terms = self._loss(batch, True, self.generator)
             if not torch.isfinite(loss):
-                raise ValueError(f"loss is not finite at step {self.step}; lower train.lr or look at the data")
+                raise UserError(f"loss is not finite at step {self.step}; lower train.lr or look at the data")
             self.optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config["train"]["clip"])
@@ -184,12 +185,12 @@ class Trainer:
 
     def resume(self) -> None:
         if not self.path.exists():
-            raise ValueError(f"{self.path}: nothing to resume; train without --resume first")
+            raise UserError(f"{self.path}: nothing to resume; train without --resume first")
         c = load_checkpoint(self.run)
         if c["config"]["model"] != self.config["model"]:
-            raise ValueError(f"{self.path}: was trained with another model configuration")
+            raise UserError(f"{self.path}: was trained with another model configuration")
         if c["data"]["sha256"] != file_hash(self.data):
-            raise ValueError(f"{self.path}: was trained on other data ({c['data']['path']})")
+            raise UserError(f"{self.path}: was trained on other data ({c['data']['path']})")
         self.model.load_state_dict(c["model"])
         self.optimizer.load_state_dict(c["optimizer"])
         self.scheduler.load_state_dict(c["scheduler"])
@@ -200,7 +201,7 @@ class Trainer:
 def load_checkpoint(run: Path | str) -> dict:
     path = Path(run) / "checkpoint.pt"
     if not path.exists():
-        raise ValueError(f"{path}: no such checkpoint; `intabs train --out {run}` makes one")
+        raise UserError(f"{path}: no such checkpoint; `intabs train --out {run}` makes one")
     return torch.load(path, map_location="cpu", weights_only=True)
 
 

@@ -1,0 +1,88 @@
+// Grey frames of all cameras in, object poses in W out. The same code runs in intabs_perception, in in-process
+// rollouts and in dataset preprocessing. Single thread; the answer depends on the sequence of frames alone.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <opencv2/core/mat.hpp>
+#include <optional>
+#include <utility>
+#include <vector>
+
+#include "intabs/core/types.h"
+#include "intabs/perception/config.h"
+#include "intabs/perception/detector.h"
+#include "intabs/perception/object_solver.h"
+
+namespace intabs {
+
+using GrayImages = std::vector<cv::Mat>;  // one a camera, (H, W) CV_8UC1; empty: this camera gave nothing
+using CameraDetections = std::array<TagDetections, kMaxCameras>;
+
+class Pipeline {
+ public:
+  // A pose stays valid for so long after the last frame that showed it: arm and fingers hide tags for moments.
+  static constexpr double kHoldSeconds = 0.5;
+  // The camera's place is the mean over so many frames of the ground tag, then fixed.
+  static constexpr int kGroundFrames = 10;
+
+  explicit Pipeline(PerceptionConfig config);  // throws what Check() throws
+
+  // out: every configured object in its slot.
+  //   Seen: pose and covariance of this frame, cameras that contributed, age 0, valid.
+  //   Not seen, or its views contradict each other: the last pose with age growing, cameras 0; valid up to an age of
+  //     kHoldSeconds, invalid after it (the pose is kept, the age grows on).
+  //   Never seen: null pose, invalid, age since the first frame.
+  // A camera contributes once the ground tag showed where it stands, and not in a frame that shows the ground tag
+  // elsewhere (moved camera, swapped cables).
+  // detections: what each camera saw, at most kMaxTags each, sorted by id.
+  // utime of both is exposure_us; seq counts the calls. An exposure earlier than the last one forgets all poses.
+  // Throws std::runtime_error when the number, size or type of the images does not fit the configuration.
+  void Process(const GrayImages& images, int64_t frame_seq, int64_t exposure_us, ObjectPoses& out,
+               CameraDetections& detections);
+
+  void Reset();           // as new
+  void RedoExtrinsics();  // finds the places of the cameras anew; poses are kept
+
+  const PerceptionConfig& config() const { return config_; }
+  std::optional<Pose> X_WC(int camera) const;  // unset: the ground tag was not seen yet
+  // False when the last frame showed the ground tag over 3 px off its place.
+  bool in_place(int camera) const { return cameras_[camera].in_place; }
+  double detect_us(int camera) const { return cameras_[camera].detect_us; }  // tag detection of the last frame
+
+ private:
+  struct Camera {
+    Camera(CameraModel m, TagDetector d) : model(std::move(m)), detector(std::move(d)) {}
+    CameraModel model;
+    TagDetector detector;
+    std::optional<Pose> X_WC;
+    int ground_frames = 0;
+    TagCorners ground_sum;
+    bool in_place = true;
+    double detect_us = 0;
+    std::vector<SeenTag> seen;
+  };
+  struct Track {
+    Pose X_WO;
+    std::array<float, 21> covariance{};
+    bool seen = false;  // ever
+    int64_t seen_us = 0;
+    int missing_frames = 0;  // since it was seen last
+  };
+
+  void Place(Camera& camera);
+  bool ScanDue(int camera) const;
+  std::vector<cv::Rect> Expected(const Camera& camera, int64_t exposure_us) const;
+
+  PerceptionConfig config_;
+  std::vector<Camera> cameras_;
+  std::array<Track, kMaxObjects> tracks_;
+  int64_t seq_ = 0;
+  int64_t first_us_ = 0;
+  int64_t last_us_ = 0;
+};
+
+// (H, W, 3) RGB, 8 bit, to grey as every user of Pipeline does it.
+void RgbToGray(const cv::Mat& rgb, cv::Mat& gray);
+
+}  // namespace intabs

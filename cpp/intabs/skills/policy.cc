@@ -1,0 +1,75 @@
+#include "intabs/skills/policy.h"
+
+#include <chrono>
+#include <stdexcept>
+
+namespace intabs {
+namespace {
+
+template <typename Vector>
+Vector ReadVector(const Manifest& manifest, const std::string& dir, const std::string& path) {
+  const std::vector<double> numbers = manifest.Numbers(path);
+  Vector v;
+  if (static_cast<int>(numbers.size()) != v.size()) {
+    throw std::runtime_error(dir + "/manifest.json: " + path + " has " + std::to_string(numbers.size()) +
+                             " numbers, this program needs " + std::to_string(v.size()));
+  }
+  for (int i = 0; i < v.size(); ++i) v[i] = static_cast<float>(numbers[i]);
+  return v;
+}
+
+void Demand(bool ok, const std::string& dir, const std::string& what) {
+  if (!ok) throw std::runtime_error(dir + "/manifest.json: " + what);
+}
+
+}  // namespace
+
+Policy Policy::Load(const std::string& dir, const ArmModel& arm) { return FromWeights(WeightsFile::Load(dir), arm); }
+
+Policy Policy::FromWeights(const WeightsFile& weights, const ArmModel& arm) {
+  const std::string& dir = weights.label();
+  const Manifest& manifest = weights.manifest();
+  const std::string layout = manifest.Text("/state_layout");
+  Demand(layout == kStateLayout, dir, "state layout \"" + layout + "\", this program knows \"" + kStateLayout + "\"");
+  const int64_t period = manifest.Integer("/policy_period_us");
+  Demand(period == kPolicyPeriodUs, dir,
+         "policy period " + std::to_string(period) + " us, this program runs at " + std::to_string(kPolicyPeriodUs));
+  Policy policy(arm, Network(weights, "pi"));
+  const NetworkSpec& spec = manifest.network("pi");
+  Demand(spec.input == kStateDim + kLatentDim, dir,
+         "pi takes " + std::to_string(spec.input) + " inputs, the state layout and z give " +
+             std::to_string(kStateDim + kLatentDim));
+  policy.agent_head_ = policy.pi_.HeadIndex("agent");
+  policy.environment_head_ = policy.pi_.HeadIndex("environment");
+  Demand(policy.pi_.head_size(policy.agent_head_) == kAgentActionDim &&
+             policy.pi_.head_size(policy.environment_head_) == kEnvironmentActionDim,
+         dir, "pi's heads must be agent (7) and environment (24)");
+  policy.normalizer_.mean = ReadVector<StateVector>(manifest, dir, "/normalizer/state_mean");
+  const StateVector scale = ReadVector<StateVector>(manifest, dir, "/normalizer/state_scale");
+  Demand((scale.array() > 0).all(), dir, "/normalizer/state_scale must be positive");
+  policy.normalizer_.inverse_scale = scale.cwiseInverse();
+  policy.normalizer_.limit = static_cast<float>(manifest.Number("/normalizer/limit"));
+  policy.agent_scale_ =
+      ReadVector<Eigen::Matrix<float, kAgentActionDim, 1>>(manifest, dir, "/normalizer/agent_action_scale");
+  policy.environment_scale_ =
+      ReadVector<Eigen::Matrix<float, kEnvironmentActionDim, 1>>(manifest, dir, "/normalizer/environment_action_scale");
+  return policy;
+}
+
+Status Policy::Step(const Observation& observation, const LatentVector& z, Action& action) noexcept {
+  StateVector s;
+  if (const Status status = AssembleState(arm_, observation, s); status != Status::kOk) return status;
+  normalizer_.Apply(s);
+  input_ << s, z;
+  const auto before = std::chrono::steady_clock::now();
+  if (const Status status = pi_.Step(input_.data()); status != Status::kOk) return status;
+  infer_us_ = std::chrono::duration<float, std::micro>(std::chrono::steady_clock::now() - before).count();
+  const auto agent = pi_.Head(agent_head_);
+  const auto environment = pi_.Head(environment_head_);
+  for (int i = 0; i < kNumJoints; ++i) action.dq_step[i] = agent[i] * agent_scale_[i];
+  action.gripper_closed = agent[kNumJoints] > 0.f;
+  for (int i = 0; i < kEnvironmentActionDim; ++i) action.object_motion[i] = environment[i] * environment_scale_[i];
+  return action.dq_step.allFinite() && action.object_motion.allFinite() ? Status::kOk : Status::kInvalidInput;
+}
+
+}  // namespace intabs

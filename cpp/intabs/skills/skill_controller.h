@@ -1,0 +1,35 @@
+// One policy tick from messages to message: LITE6_STATUS + OBJECT_POSES -> LITE6_COMMAND. The same object runs in the
+// process intabs_control and in in-process rollouts, so both give the same trajectory.
+#pragma once
+
+#include "intabs/skills/skill_player.h"
+
+namespace intabs {
+
+inline constexpr int64_t kMaxPoseAgeUs = 500000;  // older object poses end the plan: perception is gone
+
+class SkillController {
+ public:
+  // session: random, > 0; names this controller to the driver.
+  SkillController(Policy policy, int64_t session) : player_(std::move(policy)), session_(session) {}
+
+  Status Start(int64_t plan_id, std::span<const Skill> skills) noexcept { return player_.Start(plan_id, skills); }
+  void Abort(EndReason why) noexcept { player_.Abort(why); }
+
+  // Real-time safe. Always fills a command that is safe to send: while nothing is played it asks the driver to hold.
+  // Returns what the player said. Ends the plan (see PlayerStatus) if poses are older than kMaxPoseAgeUs or if the
+  // driver is in fault, stopped, or obeys another session.
+  Status Tick(const ArmStatus& status, const ObjectPoses& poses, ArmCommand& command) noexcept;
+
+  SkillPlayer& player() noexcept { return player_; }
+  const SkillPlayer& player() const noexcept { return player_; }
+  int64_t session() const noexcept { return session_; }
+
+ private:
+  SkillPlayer player_;
+  int64_t session_;
+  int64_t seq_ = 0;
+  bool gripper_closed_ = false;
+};
+
+}  // namespace intabs

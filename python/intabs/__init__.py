@@ -1,0 +1,1 @@
+"""Interaction abstractions: demonstrations in, skills out, the arm moves. `intabs --help` says what it does."""

@@ -1,0 +1,273 @@
+"""Plays the plan of a task with the C++ programs, watches, and scores. Python starts, watches and stops them; between
+camera and arm there is none of it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from intabs import bus, messages, paths
+from intabs.errors import UserError
+from intabs.processes import Processes, shared_memory_name, terminated_like_interrupted
+
+WEIGHTS = "lite6"
+SUBGOALS = {"pick_place": ("grasped", "lifted", "placed")}
+SETTLE_S = 2.0  # after the plan's end: so long may success take to show
+TICK_S = 0.04  # policy
+
+# skills/skill_player.h EndReason
+RUNNING, FINISHED = 1, 2
+END_REASONS = {
+    3: "the plan was aborted",
+    4: "perception went silent",
+    5: "a reading or the policy's output was not finite",
+    6: "the driver refused to go on (fault, stop, or another session)",
+}
+
+
+@dataclass
+class Options:
+    task: str = "pick_place"
+    perception: str = "tags"
+    clock: str = "lockstep"
+    seed: int = 0
+    spread: float = 2.0  # cm
+    out: Path = Path("out/demo")
+    viewer: bool = False
+
+
+def load_plan(task: str, weights: Path) -> list[dict]:
+    """Skills of the task's shipped plan."""
+    if not weights.is_dir():
+        raise UserError(f"{weights}: no such weights; train and export them, or check out the repository whole")
+    path = weights / "plans" / f"{task}.json"
+    if not path.is_file():
+        known = sorted(p.stem for p in (weights / "plans").glob("*.json"))
+        raise UserError(f"unknown task '{task}': known are {', '.join(known) or 'none'} ({path.parent})")
+    try:
+        skills = json.loads(path.read_text())["skills"]
+        messages.plan_parts(1, skills)
+    except (ValueError, KeyError, TypeError) as e:
+        raise UserError(f"{path}: not a plan ({type(e).__name__}: {e}); export the weights again") from None
+    if not skills:
+        raise UserError(f"{path}: has no skills; export the weights again")
+    return skills
+
+
+class _Run:
+    """What is heard during one run. All decisions use the plant's clock, so in lockstep they fall the same way each
+    time however late a message comes to us."""
+
+    def __init__(self, plan_id: int):
+        self.plan_id = plan_id
+        self.spoke = time.monotonic()  # the plant, by our clock
+        self.truth: dict[int, messages.plant_truth_t] = {}  # by frame_seq
+        self.poses: dict[int, messages.object_poses_t] = {}  # by frame_seq
+        self.skill: messages.skill_status_t | None = None
+        self.skill_utimes: list[int] = []
+        self.finished_us: int | None = None
+        self.end_reason = 0
+        self.fps = 0.0
+
+    def on_truth(self, m) -> None:
+        self.spoke = time.monotonic()
+        self.truth[m.frame_seq] = m
+
+    def on_poses(self, m) -> None:
+        self.poses[m.frame_seq] = m
+
+    def on_skill(self, m) -> None:
+        if m.plan_id != self.plan_id or m.end_reason < RUNNING:
+            return
+        if self.skill is None or m.utime > self.skill.utime:
+            self.skill_utimes.append(m.utime)
+            self.skill = m
+        if m.end_reason != RUNNING and self.finished_us is None:
+            self.finished_us, self.end_reason = m.utime, m.end_reason
+
+    def on_perception(self, m) -> None:
+        if m.n:
+            self.fps = min(m.fps[: m.n])
+
+    @property
+    def start_us(self) -> int:
+        return self.skill_utimes[0]
+
+    def end(self, limit_s: float) -> tuple[int, bool] | None:
+        """(time on the plant's clock, success), or None while it goes on."""
+        if self.skill is None or not self.truth:
+            return None
+        latest = max(t.utime for t in self.truth.values())
+        if self.finished_us is not None:
+            if self.end_reason != FINISHED:
+                return self.finished_us, False
+            after = sorted((t.utime, t.success) for t in self.truth.values() if t.utime >= self.finished_us)
+            for utime, success in after:
+                if success:
+                    return utime, True
+                if utime >= self.finished_us + SETTLE_S * 1e6:
+                    return utime, False
+        limit_us = self.start_us + int(limit_s * 1e6)
+        return (limit_us, False) if latest >= limit_us else None
+
+    def subgoals(self, end_us: int) -> int:
+        """Bits of the sub-goals that were reached at some time."""
+        bits = 0
+        for t in self.truth.values():
+            if t.utime <= end_us:
+                bits |= t.subgoals
+        return bits
+
+    def object_errors_mm(self, end_us: int) -> list[float]:
+        """Distance of each valid pose from the truth of the same frame."""
+        errors = []
+        for seq, poses in self.poses.items():
+            truth = self.truth.get(seq)
+            if truth is None or not self.start_us <= truth.utime <= end_us:
+                continue
+            for slot in range(len(poses.id)):
+                if poses.valid[slot] and poses.id[slot] >= 0:
+                    errors.append(1e3 * math.dist(poses.p_WO[slot], truth.p_WO[slot]))
+        return errors
+
+
+def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, str]:
+    """One run. Returns its figures (as in summary.json) and, if the task failed, why. Raises UserError if something
+    broke. `report(share, text)` is called while it runs."""
+    weights = paths.MODELS / "weights" / WEIGHTS
+    skills = load_plan(options.task, weights)
+    programs = {name: paths.program(f"intabs_{name}") for name in ("plant", "perception", "control")}
+    bus.require_route()
+    out = Path(options.out)
+    out.mkdir(parents=True, exist_ok=True)
+    figures = {name: out / "logs" / f"{name}.json" for name in programs}
+    for stale in (*figures.values(), out / "summary.json", out / "video.mp4", out / "strip.png"):
+        stale.unlink(missing_ok=True)
+
+    url, ring = bus.private_url(), shared_memory_name()
+    run = _Run(plan_id=random.SystemRandom().getrandbits(62) + 1)
+    limit_s = sum(s["max_ticks"] for s in skills) * TICK_S + 5.0
+    with terminated_like_interrupted(), Processes(out / "logs") as processes:
+        listener = bus.Bus(url)
+        listener.subscribe("PLANT_TRUTH", run.on_truth)
+        listener.subscribe("OBJECT_POSES", run.on_poses)
+        listener.subscribe("SKILL_STATUS", run.on_skill)
+        listener.subscribe("PERCEPTION_STATUS", run.on_perception)
+
+        def wait_for(what: Callable[[], bool], patience_s: float, silence: str, again=lambda: None) -> None:
+            until = time.monotonic() + patience_s
+            while not what():
+                processes.check()
+                if time.monotonic() > until:
+                    raise UserError(f"{silence} within {patience_s:.0f} s; what it said is in {out / 'logs'}")
+                again()
+                listener.handle(100)
+
+        report(0.0, "starting")
+        processes.start(
+            programs["plant"],
+            *("--lcm", url, "--models", paths.MODELS, "--task", options.task, "--seed", options.seed),
+            *("--spread", options.spread, "--clock", options.clock, "--ring", ring, "--cameras"),
+            *("--video", out / "video.mp4", "--strip", out / "strip.png", "--json", figures["plant"]),
+            *(["--viewer"] if options.viewer else []),
+        )
+        wait_for(lambda: run.truth, 30, "intabs_plant said nothing")
+        if options.perception == "tags":
+            processes.start(programs["perception"], "--lcm", url, "--ring", ring, "--json", figures["perception"])
+        processes.start(
+            programs["control"],
+            *("--lcm", url, "--weights", weights, "--perception", options.perception),
+            *("--clock", options.clock, "--json", figures["control"]),
+        )
+        if options.perception == "tags":
+            wait_for(lambda: run.poses, 20, "intabs_perception sent no poses")
+        plan = messages.plan_parts(run.plan_id, skills)
+
+        def send_plan() -> None:
+            for part in plan:
+                listener.publish("SKILL_PLAN", part)
+
+        wait_for(lambda: run.skill, 20, "intabs_control did not take the plan", again=send_plan)
+
+        while (end := run.end(limit_s)) is None:
+            processes.check()
+            if not listener.handle(100) and time.monotonic() - run.spoke > 15:
+                raise UserError(f"intabs_plant fell silent; what it said is in {out / 'logs'}")
+            report(*_standing(run))
+        said = {name: processes.last_line(name) for name in processes.running}
+        codes = processes.stop(patience_s=60)
+    for name, code in codes.items():
+        if code != 0:
+            raise UserError(f"{name} did not end cleanly (exit code {code}): {said[name]}")
+
+    end_us, success = end
+    summary = _summary(options, run, end_us, success, {n: _figures(f) for n, f in figures.items()})
+    return summary, "" if success else _why(run, summary, end_us)
+
+
+def _standing(run: _Run) -> tuple[float, str]:
+    skill = run.skill
+    share = (skill.skill_index + skill.progress) / max(skill.n_skills, 1)
+    at_s = (skill.utime - run.start_us) * 1e-6
+    return share, f"skill {skill.skill_index + 1} of {skill.n_skills}, {at_s:.1f} s"
+
+
+def _figures(path: Path) -> dict:
+    return json.loads(path.read_text()) if path.exists() else {}
+
+
+def _percentile(values: list[float], share: float) -> float | None:
+    """Nearest rank; None without values."""
+    if not values:
+        return None
+    ordered = sorted(values)
+    return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
+
+
+def _summary(options: Options, run: _Run, end_us: int, success: bool, figures: dict[str, dict]) -> dict:
+    bits = run.subgoals(end_us)
+    errors = run.object_errors_mm(end_us)
+    control = figures["control"].get("control", {})
+    perception = figures["perception"]
+    return {
+        "task": options.task,
+        "seed": options.seed,
+        "spread": options.spread,
+        "perception_source": options.perception,
+        "clock": options.clock,
+        "success": success,
+        "subtasks": [
+            {"name": name, "success": bool(bits >> i & 1)} for i, name in enumerate(SUBGOALS.get(options.task, ()))
+        ],
+        "duration_s": round((end_us - run.start_us) * 1e-6, 3),
+        "control": {
+            "rate_hz": control.get("rate_hz"),
+            "ticks": sum(u <= end_us for u in run.skill_utimes),
+            "overruns": control.get("overruns"),
+            "latency_us": control.get("latency_us"),
+        },
+        "policy": figures["control"].get("policy", {}),
+        "perception": {
+            "frames": sum(run.start_us <= p.exposure_utime <= end_us for p in run.poses.values()),
+            "fps": round(run.fps, 2),
+            "detect_ms": perception.get("detect_ms", {"p50": None}),
+            "object_error_mm": {
+                key: None if value is None else round(value, 3)
+                for key, value in (("p50", _percentile(errors, 0.5)), ("p95", _percentile(errors, 0.95)))
+            },
+        },
+    }
+
+
+def _why(run: _Run, summary: dict, end_us: int) -> str:
+    missed = [s["name"] for s in summary["subtasks"] if not s["success"]]
+    reason = END_REASONS.get(run.end_reason)
+    if reason is None:
+        reason = "not " + ", ".join(missed) if missed else "the goal state did not last"
+    return f"{reason} (after {summary['duration_s']:.1f} s)"

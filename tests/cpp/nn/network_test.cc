@@ -1,0 +1,191 @@
+#include "intabs/nn/network.h"
+
+#include <catch2/catch.hpp>
+#include <limits>
+
+#include "common/alloc_hook.h"
+#include "intabs/nn/heads.h"
+#include "nn/random_weights.h"
+
+using namespace intabs;
+
+namespace {
+
+const NetworkSpec kPi{.input = 9, .input_linear = 16, .layers = 3, .hidden = 16, .residual = true,
+                      .heads = {{"a_log_std", 4}, {"a_mean", 4}, {"b", 1}, {"e_mean", 2}}};
+
+Eigen::MatrixXf Inputs(int n, int T, unsigned seed) {
+  std::mt19937 rng(seed);
+  std::normal_distribution<float> normal;
+  return Eigen::MatrixXf::NullaryExpr(n, T, [&] { return normal(rng); });
+}
+
+Eigen::VectorXf AllHeads(const Network& net) {
+  std::vector<float> out;
+  for (int i = 0; i < net.num_heads(); ++i) out.insert(out.end(), net.Head(i).begin(), net.Head(i).end());
+  return Eigen::Map<Eigen::VectorXf>(out.data(), static_cast<int>(out.size()));
+}
+
+// The LSTM written out once more, straight from torch's documentation, in double and without any of our code.
+std::vector<Eigen::VectorXd> ByTheBook(const WeightsFile& w, const NetworkSpec& s, const Eigen::MatrixXf& X) {
+  const auto M = [&](const std::string& name) -> Eigen::MatrixXd { return w.tensor("net." + name).cast<double>(); };
+  const auto sigmoid = [](double v) { return 1 / (1 + std::exp(-v)); };
+  std::vector<Eigen::VectorXd> h(s.layers, Eigen::VectorXd::Zero(s.hidden)), c = h, out;
+  for (int t = 0; t < X.cols(); ++t) {
+    Eigen::VectorXd x = X.col(t).cast<double>();
+    if (s.input_linear > 0) x = (M("input.weight") * x + M("input.bias")).eval();
+    for (int l = 0; l < s.layers; ++l) {
+      const std::string p = "lstm." + std::to_string(l) + ".";
+      const Eigen::VectorXd g = M(p + "weight_ih") * x + M(p + "bias_ih") + M(p + "weight_hh") * h[l] + M(p + "bias_hh");
+      for (int k = 0; k < s.hidden; ++k) {
+        const double i = sigmoid(g[k]), f = sigmoid(g[s.hidden + k]), gg = std::tanh(g[2 * s.hidden + k]),
+                     o = sigmoid(g[3 * s.hidden + k]);
+        c[l][k] = f * c[l][k] + i * gg;
+        h[l][k] = o * std::tanh(c[l][k]);
+      }
+      x = s.residual && l > 0 ? Eigen::VectorXd(x + h[l]) : h[l];
+    }
+    out.push_back(x);
+  }
+  return out;
+}
+
+}  // namespace
+
+TEMPLATE_TEST_CASE("The Eigen stack follows the equations", "", float, double) {
+  const double bound = std::is_same_v<TestType, float> ? 1e-5 : 1e-12;
+  for (const bool residual : {false, true}) {
+    NetworkSpec s = kPi;
+    s.residual = residual;
+    s.input_linear = 0;
+    const WeightsFile w = MakeRandomWeights(s, 3, 2);
+    const Eigen::MatrixXf X = Inputs(s.input, 200, 4);
+    const auto want = ByTheBook(w, s, X);
+    Lstm<TestType> lstm(w, "net");
+    Eigen::Matrix<TestType, Eigen::Dynamic, 1> y(s.hidden);
+    double worst = 0;
+    for (int t = 0; t < X.cols(); ++t) {
+      const Eigen::Matrix<TestType, Eigen::Dynamic, 1> x = X.col(t).cast<TestType>();
+      lstm.Step(x.data(), y.data());
+      worst = std::max(worst, (y.template cast<double>() - want[t]).cwiseAbs().maxCoeff());
+    }
+    CAPTURE(residual);
+    CHECK(worst <= bound);
+  }
+}
+
+TEST_CASE("Step and Sequence agree, and Sequence leaves the state alone") {
+  Network net(MakeRandomWeights(kPi, 5), "net");
+  const Eigen::MatrixXf X = Inputs(kPi.input, 40, 6);
+  const RowMatrixXf rows = X.transpose();
+  std::vector<RowMatrixXf> heads;
+  Network other = net;
+  for (int t = 0; t < 40; ++t) {
+    REQUIRE(net.Step(X.col(t).data()) == Status::kOk);
+    REQUIRE(other.Step(X.col(t).data()) == Status::kOk);
+    other.Sequence(rows.topRows(t + 1), heads);
+    for (int i = 0; i < net.num_heads(); ++i) {
+      REQUIRE((heads[i].row(t).transpose() - net.Head(i)).cwiseAbs().maxCoeff() < 1e-5f);
+    }
+  }
+  CHECK(AllHeads(net) == AllHeads(other));
+  net.EncodeFinal(rows);
+  for (int i = 0; i < net.num_heads(); ++i) {
+    CHECK((heads[i].row(39).transpose() - net.Head(i)).cwiseAbs().maxCoeff() < 1e-5f);
+  }
+}
+
+TEST_CASE("Reset, saved and restored states, and copies give the same outputs again") {
+  Network net(MakeRandomWeights(kPi, 7), "net");
+  const Eigen::MatrixXf X = Inputs(kPi.input, 60, 8);
+  std::vector<Eigen::VectorXf> first;
+  std::vector<float> state(net.state_size());
+  std::optional<Network> copy;
+  for (int t = 0; t < 60; ++t) {
+    if (t == 30) {
+      net.SaveState(state.data());
+      copy.emplace(net);
+    }
+    REQUIRE(net.Step(X.col(t).data()) == Status::kOk);
+    first.push_back(AllHeads(net));
+  }
+  net.Reset();
+  for (int t = 0; t < 60; ++t) {
+    REQUIRE(net.Step(X.col(t).data()) == Status::kOk);
+    REQUIRE(AllHeads(net) == first[t]);
+  }
+  net.RestoreState(state.data());
+  for (int t = 30; t < 60; ++t) {
+    REQUIRE(net.Step(X.col(t).data()) == Status::kOk);
+    REQUIRE(copy->Step(X.col(t).data()) == Status::kOk);
+    REQUIRE(AllHeads(net) == first[t]);
+    REQUIRE(AllHeads(*copy) == first[t]);
+  }
+}
+
+TEST_CASE("An input that is not finite is refused and changes nothing") {
+  Network net(MakeRandomWeights(kPi, 9), "net");
+  Eigen::VectorXf x = Inputs(kPi.input, 1, 10);
+  REQUIRE(net.Step(x.data()) == Status::kOk);
+  std::vector<float> before(net.state_size()), after(net.state_size());
+  net.SaveState(before.data());
+  const Eigen::VectorXf heads = AllHeads(net);
+  for (const float bad : {std::numeric_limits<float>::quiet_NaN(), -std::numeric_limits<float>::infinity()}) {
+    Eigen::VectorXf broken = x;
+    broken[kPi.input - 1] = bad;
+    CHECK(net.Step(broken.data()) == Status::kInvalidInput);
+  }
+  net.SaveState(after.data());
+  CHECK(before == after);
+  CHECK(AllHeads(net) == heads);
+}
+
+TEST_CASE("A bidirectional network has no tick, and a sequence of a wrong width is refused") {
+  NetworkSpec s = kPi;
+  s.bidirectional = true;
+  Network net(MakeRandomWeights(s, 11), "net");
+  CHECK(net.Step(Inputs(s.input, 1, 1).data()) == Status::kNotReady);
+  const RowMatrixXf wrong = RowMatrixXf::Zero(4, s.input + 1);
+  CHECK_THROWS_WITH(net.EncodeFinal(wrong), "network \"net\": the sequence is 4x10, wanted Tx9, T >= 1");
+}
+
+TEST_CASE("Heads know what they mean and refuse what does not fit") {
+  Network net(MakeRandomWeights(kPi, 12), "net");
+  const GaussianHead a(net, "a"), e(net, "e", -2.5f);
+  const BernoulliHead b(net, "b");
+  REQUIRE(net.Step(Inputs(kPi.input, 1, 13).col(0).data()) == Status::kOk);
+  CHECK(a.Mean(net) == net.Head(net.HeadIndex("a_mean")));
+  CHECK(a.LogStd(net) == net.Head(net.HeadIndex("a_log_std")));
+  CHECK(e.LogStd(net) == Eigen::VectorXf::Constant(2, -2.5f));
+  CHECK(b.Probability(net) == Approx(1 / (1 + std::exp(-b.Logit(net)))));
+  CHECK_THROWS_WITH(GaussianHead(net, "z"),
+                    "network \"net\" has no head \"z_mean\"; it has a_log_std, a_mean, b, e_mean");
+  CHECK_THROWS_WITH(BernoulliHead(net, "a_mean"), "head \"a_mean\" has size 4, a Bernoulli head has 1");
+}
+
+TEST_CASE("Step, Reset and the state do not allocate") {
+  if (!AllocationHookActive()) {
+    WARN("skipped: a sanitizer owns the allocator");
+    return;
+  }
+  REQUIRE(AllocationHookSeesAll());
+  NetworkSpec s = kPi;
+  s.layers = 8;
+  s.hidden = s.input_linear = 128;
+  Network net(MakeRandomWeights(s, 14), "net");
+  const GaussianHead a(net, "a");
+  const Eigen::MatrixXf X = Inputs(s.input, 20, 15);
+  std::vector<float> state(net.state_size());
+  float sum = 0;
+  const AllocationCounter counter;
+  for (int t = 0; t < 20; ++t) {
+    if (t == 10) net.Reset();
+    if (net.Step(X.col(t).data()) != Status::kOk) break;
+    net.SaveState(state.data());
+    net.RestoreState(state.data());
+    sum += a.Mean(net).sum();
+  }
+  const int64_t n = counter.count();
+  CHECK(n == 0);
+  CHECK(sum != 0);
+}
