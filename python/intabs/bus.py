@@ -92,8 +92,11 @@ class Bus:
 
     def handle(self, timeout_ms: int) -> bool:
         """Handles everything that has arrived; waits for the first up to `timeout_ms`. False: nothing came."""
-        if self._lcm.handle_timeout(timeout_ms) <= 0:
+        try:
+            if self._lcm.handle_timeout(timeout_ms) <= 0:
+                return False
+            while self._lcm.handle_timeout(0) > 0:
+                pass
+        except OSError:  # a signal came while it waited; Python's own handler has the say
             return False
-        while self._lcm.handle_timeout(0) > 0:
-            pass
         return True

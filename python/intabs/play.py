@@ -64,8 +64,8 @@ class _Run:
     """What is heard during one run. All decisions use the plant's clock, so in lockstep they fall the same way each
     time however late a message comes to us."""
 
-    def __init__(self, plan_id: int):
-        self.plan_id = plan_id
+    def __init__(self, plan_id: int, lockstep: bool):
+        self.plan_id, self.lockstep = plan_id, lockstep
         self.spoke = time.monotonic()  # the plant, by our clock
         self.truth: dict[int, messages.plant_truth_t] = {}  # by frame_seq
         self.poses: dict[int, messages.object_poses_t] = {}  # by frame_seq
@@ -85,7 +85,9 @@ class _Run:
     def on_skill(self, m) -> None:
         if m.plan_id != self.plan_id or m.end_reason < RUNNING:
             return
-        if self.skill is None or m.utime > self.skill.utime:
+        # The plan is acknowledged before its first tick; only simulated time has a tick at 0.
+        ticked = m.utime > 0 or self.lockstep
+        if ticked and (self.skill is None or m.utime > self.skill.utime):
             self.skill_utimes.append(m.utime)
             self.skill = m
         if m.end_reason != RUNNING and self.finished_us is None:
@@ -100,21 +102,24 @@ class _Run:
         return self.skill_utimes[0]
 
     def end(self, limit_s: float) -> tuple[int, bool] | None:
-        """(time on the plant's clock, success), or None while it goes on."""
+        """(time on the plant's clock, success), or None while it goes on. Told only when the plant has gone past that
+        time: then all messages up to it are in."""
         if self.skill is None or not self.truth:
             return None
-        latest = max(t.utime for t in self.truth.values())
-        if self.finished_us is not None:
-            if self.end_reason != FINISHED:
-                return self.finished_us, False
-            after = sorted((t.utime, t.success) for t in self.truth.values() if t.utime >= self.finished_us)
-            for utime, success in after:
-                if success:
-                    return utime, True
-                if utime >= self.finished_us + SETTLE_S * 1e6:
-                    return utime, False
-        limit_us = self.start_us + int(limit_s * 1e6)
-        return (limit_us, False) if latest >= limit_us else None
+        end = self._end(self.start_us + int(limit_s * 1e6))
+        return end if end and max(t.utime for t in self.truth.values()) > end[0] else None
+
+    def _end(self, limit_us: int) -> tuple[int, bool] | None:
+        if self.finished_us is None:
+            return limit_us, False
+        if self.end_reason != FINISHED:
+            return self.finished_us, False
+        for utime, success in sorted((t.utime, t.success) for t in self.truth.values() if t.utime >= self.finished_us):
+            if success:
+                return utime, True
+            if utime >= self.finished_us + SETTLE_S * 1e6:
+                return utime, False
+        return None
 
     def subgoals(self, end_us: int) -> int:
         """Bits of the sub-goals that were reached at some time."""
@@ -151,7 +156,7 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
         stale.unlink(missing_ok=True)
 
     url, ring = bus.private_url(), shared_memory_name()
-    run = _Run(plan_id=random.SystemRandom().getrandbits(62) + 1)
+    run = _Run(random.SystemRandom().getrandbits(62) + 1, options.clock == "lockstep")
     limit_s = sum(s["max_ticks"] for s in skills) * TICK_S + 5.0
     with terminated_like_interrupted(), Processes(out / "logs") as processes:
         listener = bus.Bus(url)
@@ -179,7 +184,11 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
         )
         wait_for(lambda: run.truth, 30, "intabs_plant said nothing")
         if options.perception == "tags":
-            processes.start(programs["perception"], "--lcm", url, "--ring", ring, "--json", figures["perception"])
+            processes.start(
+                programs["perception"],
+                *("--lcm", url, "--ring", ring, "--config", paths.MODELS / "config" / "perception.yaml"),
+                *("--json", figures["perception"]),
+            )
         processes.start(
             programs["control"],
             *("--lcm", url, "--weights", weights, "--perception", options.perception),
@@ -200,11 +209,10 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
             if not listener.handle(100) and time.monotonic() - run.spoke > 15:
                 raise UserError(f"intabs_plant fell silent; what it said is in {out / 'logs'}")
             report(*_standing(run))
-        said = {name: processes.last_line(name) for name in processes.running}
         codes = processes.stop(patience_s=60)
     for name, code in codes.items():
         if code != 0:
-            raise UserError(f"{name} did not end cleanly (exit code {code}): {said[name]}")
+            raise UserError(f"{name} did not end cleanly (exit code {code}): {processes.last_line(name)}")
 
     end_us, success = end
     summary = _summary(options, run, end_us, success, {n: _figures(f) for n, f in figures.items()})

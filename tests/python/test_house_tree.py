@@ -56,7 +56,15 @@ def test_a_host_and_a_path_are_found():
 
 
 def test_top_folders_and_front_door_are_there():
-    for name in ("README.md", "LICENSE", "CMakeLists.txt", "CMakePresets.json", ".clang-format", ".clang-tidy", ".ci/run"):
+    for name in (
+        "README.md",
+        "LICENSE",
+        "CMakeLists.txt",
+        "CMakePresets.json",
+        ".clang-format",
+        ".clang-tidy",
+        ".ci/run",
+    ):
         assert (paths.ROOT / name).is_file(), name
     for folder in ("cpp", "python", "tests", "tools", "proto_lcm", "models"):
         assert (paths.ROOT / folder / "README.md").is_file(), f"{folder}/README.md"

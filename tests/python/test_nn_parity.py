@@ -10,6 +10,7 @@ torch = pytest.importorskip("torch", reason="torch (the training side) is not in
 from intabs import _core  # noqa: E402
 from safetensors.numpy import save_file  # noqa: E402
 
+torch.set_num_threads(1)
 HEADS = {"agent_mean": 7, "env_mean": 12, "b": 1}
 
 

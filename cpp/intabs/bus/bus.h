@@ -12,6 +12,7 @@
 #include <cstdint>
 #include <functional>
 #include <string>
+#include <type_traits>
 #include <utility>
 
 #include "intabs/bus/codec.h"
@@ -61,7 +62,7 @@ class Bus {
   // `handler` runs inside Handle(), for every message, in the order of arrival. A datagram that is not a whole message
   // of this type changes nothing: it is counted, and `on_undecodable` runs if there is one.
   template <class M>
-  void Subscribe(const Channel<M>& channel, std::function<void(const M&)> handler,
+  void Subscribe(const Channel<M>& channel, std::type_identity_t<std::function<void(const M&)>> handler,
                  std::function<void()> on_undecodable = nullptr) {
     SubscribeBytes(channel.name,
                    [this, handler = std::move(handler), on_undecodable = std::move(on_undecodable), message = M()](

@@ -432,7 +432,7 @@ template <> struct Wire<Estop> : StringWire<intabs_lcm::estop_t, kMaxReason> {};
 
 template <class M>
 int Encode(const M& m, uint8_t* out) {
-  typename Wire<M>::Message l;
+  typename Wire<M>::Message l{};
   ToLcm(m, l);
   return l.encode(out, 0, kMaxMessageBytes);
 }
@@ -440,7 +440,7 @@ int Encode(const M& m, uint8_t* out) {
 template <class M>
 bool Decode(const uint8_t* data, size_t size, M& m) noexcept {
   if (size > kMaxMessageBytes || !Wire<M>::IsSafe(data, size)) return false;
-  typename Wire<M>::Message l;
+  typename Wire<M>::Message l{};
   return l.decode(data, 0, static_cast<int>(size)) == static_cast<int>(size) && FromLcm(l, m);
 }
 

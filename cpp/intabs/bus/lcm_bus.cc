@@ -19,7 +19,9 @@ constexpr char kCure[] = "ip link set lo up; ip link set lo multicast on; ip rou
 // LCM itself answers a missing route with a page of text on stderr, so the route is tried before.
 void RequireRoute(const std::string& url) {
   constexpr char kScheme[] = "udpm://";
-  if (url.rfind(kScheme, 0) != 0) return;
+  if (url.rfind(kScheme, 0) != 0) {
+    throw std::runtime_error("LCM URL \"" + url + "\" is not of UDP multicast; give one like " + kDefaultLcmUrl);
+  }
   const size_t begin = std::strlen(kScheme);
   std::string host = url.substr(begin, url.find_first_of(":?", begin) - begin);
   if (host.empty()) host = "239.255.76.67";

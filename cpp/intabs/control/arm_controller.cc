@@ -43,7 +43,7 @@ Refusal ArmController::Check(const ArmCommand& c, int64_t now_us) const noexcept
 Refusal ArmController::Accept(const ArmCommand& c, int64_t now_us) noexcept {
   const Refusal refusal = Check(c, now_us);
   if (refusal != Refusal::kAccepted) {
-    ++refused_[static_cast<int>(refusal)];
+    Count(refusal);
     return refusal;
   }
   session_ = c.session;

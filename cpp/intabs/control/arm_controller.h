@@ -33,7 +33,11 @@ class ArmController {
   // A command with mode kHold slows down and holds without a fault to come, as long as nobody commands otherwise; it leaves
   // the gripper alone.
   Refusal Accept(const ArmCommand& command, int64_t now_us) noexcept;
-  void CountUndecodable() noexcept { ++refused_[0]; }
+  // What Accept would answer.
+  Refusal Check(const ArmCommand& command, int64_t now_us) const noexcept;
+  // For a command that was refused before it came here; kAccepted stands for an undecodable one.
+  void Count(Refusal refusal) noexcept { ++refused_[static_cast<int>(refusal)]; }
+  void CountUndecodable() noexcept { Count(Refusal::kAccepted); }
 
   // Brakes within the limits and holds, latched until ResetFault.
   void Estop() noexcept;
@@ -58,7 +62,6 @@ class ArmController {
   void FillStatus(ArmStatus& status) const noexcept;
 
  private:
-  Refusal Check(const ArmCommand& command, int64_t now_us) const noexcept;
   bool CommandIsValid(int64_t now_us) const noexcept { 
     return lifetime_us_ > 0 && now_us - received_us_ <= lifetime_us_;
   }

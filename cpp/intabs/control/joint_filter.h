@@ -28,7 +28,8 @@ class JointFilter {
   // At rest at `q`; from outside the position limits it may only move inward.
   void Reset(const JointVector& q) noexcept;
 
-  // One driver tick towards `q_target` (inside the limits, finite), no joint faster than `dq_max` but while it brakes.
+  // One driver tick towards `q_target` (finite), no joint faster than `dq_max` but while it brakes. A target beyond a joint's
+  // limit is approached as far as the limit.
   void Follow(const JointVector& q_target, const JointVector& dq_max) noexcept;
 
   // One driver tick of braking, each joint as hard as it may.

@@ -1,4 +1,4 @@
-// y = W x + b. Forward is real-time safe; y and x must not overlap.
+// y = W x + b in Eigen, float or double (the reference). Forward is real-time safe; y and x must not overlap.
 #pragma once
 
 #include <Eigen/Core>
@@ -12,7 +12,6 @@ class Linear {
  public:
   using Vector = Eigen::Matrix<Scalar, Eigen::Dynamic, 1>;
 
-  Linear() = default;
   Linear(const RowMatrixXf& weight, const RowMatrixXf& bias)
       : weight_(weight.cast<Scalar>()), bias_(bias.col(0).cast<Scalar>()) {}
 
@@ -25,15 +24,8 @@ class Linear {
     out.noalias() += weight_ * Eigen::Map<const Vector>(x, input_size());
   }
 
-  // One input a row: Y (T x out) = X (T x in) W' + b'. Y is given in its size; may allocate inside Eigen.
-  template <typename In, typename Out>
-  void ForwardRows(const In& X, Out& Y) const {
-    Y.noalias() = X * weight_.transpose();
-    Y.rowwise() += bias_.transpose();
-  }
-
  private:
-  Eigen::Matrix<Scalar, Eigen::Dynamic, Eigen::Dynamic, Eigen::ColMajor> weight_;
+  Eigen::Matrix<Scalar, Eigen::Dynamic, Eigen::Dynamic> weight_;
   Vector bias_;
 };
 

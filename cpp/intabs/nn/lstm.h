@@ -1,9 +1,12 @@
-// Stacked LSTM in plain Eigen, float or double: the reference. Torch's equations and gate order (torch.nn.LSTM):
+// Stacked LSTM in plain Eigen, float or double: the reference that the kernels (fast_lstm.h) are held against. Torch's
+// equations and gate order (torch.nn.LSTM):
 //   [i f g o] = W_ih x + W_hh h + b_ih + b_hh,  c' = sigmoid(f) c + sigmoid(i) tanh(g),  h' = sigmoid(o) tanh(c')
-// With `residual` a layer >= 1 hands up h' + its input where the sizes match; what it carries to the next tick stays h'.
+// With `residual` a layer >= 1 hands up h' + its input; what it carries to the next tick stays h'. With `layer_norm` a
+// layer >= 1 reads the normalised input (torch.nn.LayerNorm); the residual path goes past the norm.
 #pragma once
 
 #include <Eigen/Core>
+#include <algorithm>
 #include <cmath>
 #include <string>
 #include <vector>
@@ -71,15 +74,50 @@ class LstmCell {
   Vector gates_;
 };
 
+template <typename Scalar>
+class LayerNorm {
+ public:
+  using Vector = Eigen::Matrix<Scalar, Eigen::Dynamic, 1>;
+
+  LayerNorm(const WeightsFile& file, const std::string& prefix)
+      : weight_(file.tensor(prefix + "weight").col(0).template cast<Scalar>()),
+        bias_(file.tensor(prefix + "bias").col(0).template cast<Scalar>()) {}
+
+  // out may be in.
+  void Forward(const Scalar* in, Scalar* out) const noexcept {
+    const Eigen::Map<const Vector> x(in, weight_.size());
+    const Scalar mean = x.mean();
+    const Scalar variance = (x.array() - mean).square().mean();
+    const Scalar scale = Scalar(1) / std::sqrt(variance + Scalar(kLayerNormEpsilon));
+    Eigen::Map<Vector>(out, weight_.size()) = ((x.array() - mean) * scale * weight_.array() + bias_.array()).matrix();
+  }
+
+ private:
+  Vector weight_, bias_;
+};
+
+// Norms of layers 1, 2, ... at [0], [1], ...; empty without layer norm.
+template <typename Scalar>
+std::vector<LayerNorm<Scalar>> LayerNorms(const WeightsFile& file, const std::string& net) {
+  std::vector<LayerNorm<Scalar>> out;
+  const NetworkSpec& spec = file.manifest().network(net);
+  for (int l = 1; l < spec.layers && spec.layer_norm; ++l) {
+    out.emplace_back(file, net + ".lstm." + std::to_string(l) + ".norm.");
+  }
+  return out;
+}
+
 // Copyable; a copy has weights and state of its own.
 template <typename Scalar>
 class Lstm {
  public:
   // Network `net` of the file; must not be bidirectional.
-  Lstm(const WeightsFile& file, const std::string& net) : residual_(file.manifest().network(net).residual) {
+  Lstm(const WeightsFile& file, const std::string& net)
+      : residual_(file.manifest().network(net).residual), norms_(LayerNorms<Scalar>(file, net)) {
     const NetworkSpec& spec = file.manifest().network(net);
     for (int l = 0; l < spec.layers; ++l) cells_.emplace_back(file, net + ".lstm." + std::to_string(l) + ".", "");
-    x_.resize(spec.hidden);
+    x_.setZero(spec.hidden);
+    normalised_.setZero(spec.hidden);
   }
 
   int input_size() const { return cells_.front().input_size(); }
@@ -89,7 +127,12 @@ class Lstm {
   void Step(const Scalar* x, Scalar* y) noexcept {
     const int n = output_size();
     for (size_t l = 0; l < cells_.size(); ++l) {
-      cells_[l].Step(x);
+      if (!norms_.empty() && l > 0) {
+        norms_[l - 1].Forward(x, normalised_.data());
+        cells_[l].Step(normalised_.data());
+      } else {
+        cells_[l].Step(x);
+      }
       const Scalar* h = cells_[l].h();
       if (residual_ && l > 0) {
         for (int k = 0; k < n; ++k) x_[k] += h[k];
@@ -118,7 +161,8 @@ class Lstm {
  private:
   bool residual_;
   std::vector<LstmCell<Scalar>> cells_;
-  Eigen::Matrix<Scalar, Eigen::Dynamic, 1> x_;
+  std::vector<LayerNorm<Scalar>> norms_;
+  Eigen::Matrix<Scalar, Eigen::Dynamic, 1> x_, normalised_;
 };
 
 // Bidirectional stack, as torch's: a layer's output at t is [forward h(t), backward h(t)], which the next layer reads.
@@ -127,7 +171,8 @@ class BiLstm {
  public:
   using Rows = Eigen::Matrix<Scalar, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
 
-  BiLstm(const WeightsFile& file, const std::string& net) : residual_(file.manifest().network(net).residual) {
+  BiLstm(const WeightsFile& file, const std::string& net)
+      : residual_(file.manifest().network(net).residual), norms_(LayerNorms<Scalar>(file, net)) {
     const NetworkSpec& spec = file.manifest().network(net);
     for (int l = 0; l < spec.layers; ++l) {
       const std::string prefix = net + ".lstm." + std::to_string(l) + ".";
@@ -144,9 +189,13 @@ class BiLstm {
     const int T = static_cast<int>(X.rows()), H = output_size() / 2;
     Rows in = X;
     for (size_t l = 0; l < forward_.size(); ++l) {
+      Rows cell_in = in;
+      if (!norms_.empty() && l > 0) {
+        for (int t = 0; t < T; ++t) norms_[l - 1].Forward(in.row(t).data(), cell_in.row(t).data());
+      }
       Y.resize(T, 2 * H);
-      Run(forward_[l], in, 0, T, 1, Y, 0);
-      Run(backward_[l], in, T - 1, -1, -1, Y, H);
+      Run(forward_[l], cell_in, 0, T, 1, Y, 0);
+      Run(backward_[l], cell_in, T - 1, -1, -1, Y, H);
       if (residual_ && l > 0) Y += in;
       in = Y;
     }
@@ -156,13 +205,14 @@ class BiLstm {
   static void Run(LstmCell<Scalar>& cell, const Rows& in, int from, int to, int step, Rows& Y, int col) {
     cell.Reset();
     for (int t = from; t != to; t += step) {
-      cell.Step(in.data() + static_cast<ptrdiff_t>(t) * in.cols());
-      std::copy_n(cell.h(), cell.hidden_size(), Y.data() + static_cast<ptrdiff_t>(t) * Y.cols() + col);
+      cell.Step(in.row(t).data());
+      std::copy_n(cell.h(), cell.hidden_size(), Y.row(t).data() + col);
     }
   }
 
   bool residual_;
   std::vector<LstmCell<Scalar>> forward_, backward_;
+  std::vector<LayerNorm<Scalar>> norms_;
 };
 
 }  // namespace intabs

@@ -5,28 +5,60 @@
 #include <stdexcept>
 
 namespace intabs {
+namespace {
 
-Network Network::Load(const std::string& dir, const std::string& name) {
-  return Network(WeightsFile::Load(dir), name);
+// One column from outside to where the kernels can read it.
+void CopyColumn(const float* from, int n, float* to) noexcept { std::copy_n(from, n, to); }
+
+bool AllFinite(const float* x, ptrdiff_t n) noexcept {
+  // x * 0 is 0, or NaN for NaN and infinity; unlike a branch each, this is one pass of vectors.
+  float sum = 0;
+  for (ptrdiff_t i = 0; i < n; ++i) sum += x[i] * 0.0f;
+  return sum == 0.0f;
 }
 
-Network::Network(const WeightsFile& file, const std::string& name)
-    : name_(name), spec_(file.manifest().network(name)) {
+ptrdiff_t LinearWidth(const Cell& cell) { return static_cast<ptrdiff_t>(cell.panels) * kPanelGates; }
+
+void EnsureSize(AlignedFloats& a, size_t n) {
+  if (a.size() < n) a.resize(n);
+}
+
+}  // namespace
+
+Network Network::Load(const std::string& dir, const std::string& name, const NetworkOptions& options) {
+  return Network(WeightsFile::Load(dir), name, options);
+}
+
+Network::Network(const WeightsFile& file, const std::string& name, const NetworkOptions& options)
+    : name_(name),
+      spec_(file.manifest().network(name)),
+      lstm_(file, name, options.format.value_or(spec_.format), options.isa),
+      kernels_(lstm_.stack().kernels) {
+  spec_.format = options.format.value_or(spec_.format);
   if (spec_.input_linear > 0) {
-    input_.emplace(file.tensor(name + ".input.weight"), file.tensor(name + ".input.bias"));
+    input_.AddLinear(file.tensor(name + ".input.weight"), file.tensor(name + ".input.bias"));
+    linear_.resize(LinearWidth(input_.cell(0)));
   }
-  if (spec_.bidirectional) {
-    bilstm_.emplace(file, name);
-  } else {
-    lstm_.emplace(file, name);
-  }
+  int rows = 0;
   for (const HeadSpec& h : spec_.heads) {
-    const std::string prefix = name + ".heads." + h.name;
-    heads_.emplace_back(file.tensor(prefix + ".weight"), file.tensor(prefix + ".bias"));
-    head_out_.emplace_back(Eigen::VectorXf::Zero(h.size));
+    head_offset_.push_back(rows);
+    rows += h.size;
   }
-  x_.setZero(spec_.lstm_input());
-  top_.setZero(spec_.layer_output());
+  RowMatrixXf weight(rows, spec_.layer_output()), bias(rows, 1);
+  for (int i = 0; i < num_heads(); ++i) {
+    const std::string prefix = name + ".heads." + head_name(i);
+    weight.middleRows(head_offset_[i], head_size(i)) = file.tensor(prefix + ".weight");
+    bias.middleRows(head_offset_[i], head_size(i)) = file.tensor(prefix + ".bias");
+  }
+  heads_.AddLinear(weight, bias);
+  head_out_.resize(heads_ld());
+  x_.resize(spec_.input);
+  top_.resize(spec_.layer_output());
+  scratch_.resize(kernels_->scratch_bytes(std::max(spec_.input, spec_.layer_output()), 1) / sizeof(float) + 16);
+}
+
+size_t Network::weight_bytes() const {
+  return input_.bytes() + lstm_.stack().cells.bytes() + heads_.bytes();
 }
 
 bool Network::HasHead(std::string_view name) const noexcept {
@@ -42,70 +74,103 @@ int Network::HeadIndex(std::string_view name) const {
   throw std::runtime_error("network \"" + name_ + "\" has no head \"" + std::string(name) + "\"; it has " + known);
 }
 
+ptrdiff_t Network::heads_ld() const noexcept { return LinearWidth(heads_.cell(0)); }
+
+void Network::Heads(const float* top, ptrdiff_t ld, int n, float* out, void* scratch) const noexcept {
+  kernels_->input_gates(heads_.cell(0), top, ld, n, out, scratch);
+}
+
 Status Network::Step(const float* x) noexcept {
-  if (!lstm_) return Status::kNotReady;
-  for (int i = 0; i < spec_.input; ++i) {
-    if (!std::isfinite(x[i])) return Status::kInvalidInput;
+  if (spec_.bidirectional) return Status::kNotReady;
+  if (!AllFinite(x, spec_.input)) return Status::kInvalidInput;
+  CopyColumn(x, spec_.input, x_.data());
+  const float* in = x_.data();
+  if (input_.size() > 0) {
+    kernels_->input_gates(input_.cell(0), in, static_cast<ptrdiff_t>(x_.size()), 1, linear_.data(), scratch_.data());
+    in = linear_.data();
   }
-  if (input_) {
-    input_->Forward(x, x_.data());
-    x = x_.data();
-  }
-  lstm_->Step(x, top_.data());
-  for (size_t i = 0; i < heads_.size(); ++i) heads_[i].Forward(top_.data(), head_out_[i].data());
+  Heads(lstm_.Step(in), 0, 1, head_out_.data(), scratch_.data());
   return Status::kOk;
 }
 
-void Network::Reset() noexcept {
-  if (lstm_) lstm_->Reset();
-}
-int Network::state_size() const { return lstm_ ? lstm_->state_size() : 0; }
+void Network::Reset() noexcept { lstm_.Reset(); }
+int Network::state_size() const { return spec_.bidirectional ? 0 : lstm_.state_size(); }
 void Network::SaveState(float* out) const noexcept {
-  if (lstm_) lstm_->SaveState(out);
+  if (!spec_.bidirectional) lstm_.SaveState(out);
 }
 void Network::RestoreState(const float* in) noexcept {
-  if (lstm_) lstm_->RestoreState(in);
+  if (!spec_.bidirectional) lstm_.RestoreState(in);
 }
 
-const RowMatrixXf& Network::Top(const Eigen::Ref<const RowMatrixXf>& X) {
+const float* Network::Top(const Eigen::Ref<const RowMatrixXf>& X, int threads) {
   if (X.cols() != spec_.input || X.rows() < 1) {
     throw std::invalid_argument("network \"" + name_ + "\": the sequence is " + std::to_string(X.rows()) + "x" +
                                 std::to_string(X.cols()) + ", wanted Tx" + std::to_string(spec_.input) + ", T >= 1");
   }
-  seq_in_.resize(X.rows(), spec_.lstm_input());
-  if (input_) {
-    input_->ForwardRows(X, seq_in_);
-  } else {
-    seq_in_ = X;
-  }
-  if (bilstm_) {
-    bilstm_->Sequence(seq_in_, seq_top_);
-  } else {
-    std::vector<float> state(lstm_->state_size());
-    lstm_->SaveState(state.data());
-    lstm_->Reset();
-    seq_top_.resize(X.rows(), spec_.layer_output());
-    for (int t = 0; t < X.rows(); ++t) lstm_->Step(seq_in_.row(t).data(), seq_top_.row(t).data());
-    lstm_->RestoreState(state.data());
-  }
-  return seq_top_;
+  const int T = static_cast<int>(X.rows());
+  const ptrdiff_t ld = RoundUp(spec_.input, 16);
+  EnsureSize(seq_x_, T * ld);
+  for (int t = 0; t < T; ++t) CopyColumn(X.row(t).data(), spec_.input, seq_x_.data() + t * ld);
+  const int longest = std::max({spec_.input, spec_.lstm_input(), spec_.layer_output()});
+  EnsureSize(seq_scratch_, kernels_->scratch_bytes(longest, T) / sizeof(float) + 16);
+  if (input_.size() == 0) return lstm_.Sequence(seq_x_.data(), ld, T, threads);
+  const ptrdiff_t ld_linear = LinearWidth(input_.cell(0));
+  EnsureSize(seq_linear_, T * ld_linear);
+  kernels_->input_gates(input_.cell(0), seq_x_.data(), ld, T, seq_linear_.data(), seq_scratch_.data());
+  return lstm_.Sequence(seq_linear_.data(), ld_linear, T, threads);
 }
 
-void Network::Sequence(const Eigen::Ref<const RowMatrixXf>& X, std::vector<RowMatrixXf>& heads) {
-  const RowMatrixXf& top = Top(X);
-  heads.resize(heads_.size());
-  for (size_t i = 0; i < heads_.size(); ++i) {
-    heads[i].resize(X.rows(), head_size(static_cast<int>(i)));
-    heads_[i].ForwardRows(top, heads[i]);
+void Network::Sequence(const Eigen::Ref<const RowMatrixXf>& X, std::vector<RowMatrixXf>& heads, int threads) {
+  const float* top = Top(X, threads);
+  const int T = static_cast<int>(X.rows());
+  EnsureSize(seq_heads_, T * heads_ld());
+  Heads(top, lstm_.ld_out(), T, seq_heads_.data(), seq_scratch_.data());
+  heads.resize(num_heads());
+  for (int i = 0; i < num_heads(); ++i) {
+    heads[i] = Eigen::Map<const RowMatrixXf, 0, Eigen::OuterStride<>>(
+        seq_heads_.data() + head_offset_[i], T, head_size(i), Eigen::OuterStride<>(heads_ld()));
   }
 }
 
-void Network::EncodeFinal(const Eigen::Ref<const RowMatrixXf>& X) {
-  const RowMatrixXf& top = Top(X);
+void Network::EncodeFinal(const Eigen::Ref<const RowMatrixXf>& X, int threads) {
+  const float* top = Top(X, threads);
   const int H = spec_.hidden;
-  top_.head(H) = top.row(top.rows() - 1).head(H);
-  if (spec_.bidirectional) top_.tail(H) = top.row(0).tail(H);
-  for (size_t i = 0; i < heads_.size(); ++i) heads_[i].Forward(top_.data(), head_out_[i].data());
+  std::copy_n(top + (X.rows() - 1) * lstm_.ld_out(), H, top_.data());
+  if (spec_.bidirectional) std::copy_n(top + H, H, top_.data() + H);
+  Heads(top_.data(), 0, 1, head_out_.data(), scratch_.data());
 }
+
+// ------------------------------------------------------------------------------------------------------ NetworkBatch
+
+NetworkBatch::NetworkBatch(const Network& net, int n) : net_(net), lstm_(net.lstm_.stack(), std::max(n, 1)) {
+  if (n < 1) throw std::invalid_argument("a batch needs at least one rollout, not " + std::to_string(n));
+  if (net.spec().bidirectional) {
+    throw std::invalid_argument("network \"" + net.name_ + "\" is bidirectional: it has no tick, and no batch");
+  }
+  x_.resize(static_cast<size_t>(n) * RoundUp(net.input_size(), 16));
+  if (net.input_.size() > 0) linear_.resize(n * LinearWidth(net.input_.cell(0)));
+  head_out_.resize(n * net.heads_ld());
+  const int longest = std::max({net.spec().input, net.spec().lstm_input(), net.spec().layer_output()});
+  scratch_.resize(net.kernels_->scratch_bytes(longest, n) / sizeof(float) + 16);
+}
+
+Status NetworkBatch::Step(const float* X) noexcept {
+  const int inputs = net_.input_size();
+  if (!AllFinite(X, static_cast<ptrdiff_t>(size()) * inputs)) return Status::kInvalidInput;
+  ptrdiff_t ld = RoundUp(inputs, 16);
+  for (int j = 0; j < size(); ++j) CopyColumn(X + static_cast<ptrdiff_t>(j) * inputs, inputs, x_.data() + j * ld);
+  const float* in = x_.data();
+  if (net_.input_.size() > 0) {
+    net_.kernels_->input_gates(net_.input_.cell(0), in, ld, size(), linear_.data(), scratch_.data());
+    in = linear_.data();
+    ld = LinearWidth(net_.input_.cell(0));
+  }
+  net_.Heads(lstm_.Step(in, ld), lstm_.ld_out(), size(), head_out_.data(), scratch_.data());
+  return Status::kOk;
+}
+
+void NetworkBatch::Reset() noexcept { lstm_.Reset(); }
+void NetworkBatch::SaveState(int j, float* out) const noexcept { lstm_.SaveState(j, out); }
+void NetworkBatch::RestoreState(int j, const float* in) noexcept { lstm_.RestoreState(j, in); }
 
 }  // namespace intabs

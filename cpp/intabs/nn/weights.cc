@@ -8,6 +8,7 @@
 #include <cstring>
 #include <limits>
 #include <nlohmann/json.hpp>
+#include <random>
 #include <set>
 #include <stdexcept>
 
@@ -130,6 +131,11 @@ std::vector<Wanted> WantedTensors(const std::string& net, const NetworkSpec& s) 
       out.push_back({prefix + "bias_hh" + direction, 4 * s.hidden});
     }
   }
+  for (int l = 1; l < s.layers && s.layer_norm; ++l) {
+    const std::string prefix = net + ".lstm." + std::to_string(l) + ".norm.";
+    out.push_back({prefix + "weight", s.layer_input(l)});
+    out.push_back({prefix + "bias", s.layer_input(l)});
+  }
   for (const HeadSpec& h : s.heads) {
     out.push_back({net + ".heads." + h.name + ".weight", h.size, s.layer_output()});
     out.push_back({net + ".heads." + h.name + ".bias", h.size});
@@ -138,6 +144,13 @@ std::vector<Wanted> WantedTensors(const std::string& net, const NetworkSpec& s) 
 }
 
 }  // namespace
+
+WeightFormat ParseWeightFormat(std::string_view text) {
+  if (text == "fp32") return WeightFormat::kFp32;
+  if (text == "16") return WeightFormat::k16;
+  if (text == "8") return WeightFormat::k8;
+  throw std::runtime_error("weight format " + Quoted(text) + " is unknown; there are \"fp32\", \"16\" and \"8\"");
+}
 
 // ---------------------------------------------------------------------------------------------------------- Manifest
 
@@ -186,9 +199,14 @@ Manifest Manifest::Parse(std::string_view text, const std::string& label) {
     s.hidden = integer("hidden", 1, 16384, -1);
     s.residual = boolean("residual");
     s.bidirectional = boolean("bidirectional");
+    s.layer_norm = boolean("layer_norm");
+    if (const auto format = entry.find("format"); format != entry.end()) {
+      if (!format->is_string()) m.Fail(where + ": \"format\" must be \"fp32\", \"16\" or \"8\"");
+      s.format = ParseWeightFormat(format->get<std::string>());
+    }
     for (const auto& [key, value] : entry.items()) {
-      static const std::set<std::string> known = {"input",    "input_linear",  "layers", "hidden",
-                                                  "residual", "bidirectional", "heads"};
+      static const std::set<std::string> known = {"input",         "input_linear", "layers", "hidden", "residual",
+                                                  "bidirectional", "layer_norm",   "format", "heads"};
       if (!known.contains(key)) m.Fail(where + ": unknown key " + Quoted(key));
     }
     const auto heads = entry.find("heads");
@@ -201,6 +219,14 @@ Manifest Manifest::Parse(std::string_view text, const std::string& label) {
     }
     m.networks_.emplace_back(name, std::move(s));
   }
+  return m;
+}
+
+Manifest Manifest::Of(const std::string& name, const NetworkSpec& spec) {
+  Manifest m;
+  m.label_ = "(in memory)";
+  m.json_ = std::make_shared<const json>(json::object());
+  m.networks_.emplace_back(name, spec);
   return m;
 }
 
@@ -410,6 +436,21 @@ WeightsFile WeightsFile::Parse(std::vector<uint8_t> safetensors, Manifest manife
     if (!consumed.contains(name)) {
       Throw(label, "tensor " + Quoted(name) + " (" + ShapeText(tensor.shape) + ") is in the file, but no network of the manifest wants it");
     }
+  }
+  return w;
+}
+
+WeightsFile WeightsFile::Random(const NetworkSpec& spec, unsigned seed) {
+  WeightsFile w;
+  w.label_ = "random weights";
+  w.manifest_ = Manifest::Of("net", spec);
+  std::mt19937 rng(seed);
+  const float bound = 1.0f / std::sqrt(static_cast<float>(spec.hidden));
+  std::uniform_real_distribution<float> value(-bound, bound);
+  for (const Wanted& want : WantedTensors("net", spec)) {
+    const bool gain = want.name.ends_with("norm.weight");  // of a layer norm: about 1
+    w.tensors_.emplace(want.name, RowMatrixXf::NullaryExpr(want.rows, std::max(want.cols, 1),
+                                                           [&] { return (gain ? 1.0f : 0.0f) + value(rng); }));
   }
   return w;
 }

@@ -5,14 +5,16 @@
 //   {"schema_version": 1,
 //    "sha256": "<of weights.safetensors>",
 //    "networks": {"pi": {"input": 40, "input_linear": 128, "layers": 8, "hidden": 128, "residual": true,
-//                        "bidirectional": false, "heads": {"agent_mean": 7, "env_mean": 12}}}}
-// input_linear (0: none), residual and bidirectional may be left out (0, false). Other keys belong to other rooms,
-// which read them through Manifest.
+//                        "bidirectional": false, "layer_norm": false, "format": "fp32",
+//                        "heads": {"agent_mean": 7, "env_mean": 12}}}}
+// format: "fp32", "16" or "8", how the network runs unless the caller says otherwise. All but input, layers, hidden and
+// heads may be left out (0, false, fp32). Other keys belong to other rooms, which read them through Manifest.
 //
 // Tensors of network N, torch's names and layout, gates i, f, g, o:
 //   N.input.weight (input_linear, input), N.input.bias
 //   N.lstm.L.weight_ih (4 hidden, in), .weight_hh (4 hidden, hidden), .bias_ih, .bias_hh (4 hidden)
 //     and the same with _reverse for a bidirectional one; in = 2 hidden for its layers >= 1
+//   N.lstm.L.norm.weight, .bias (in), L >= 1: only with layer_norm
 //   N.heads.HEAD.weight (size, hidden or 2 hidden), .bias
 #pragma once
 
@@ -27,9 +29,15 @@
 #include <utility>
 #include <vector>
 
+#include "intabs/nn/kernels.h"
+
 namespace intabs {
 
 using RowMatrixXf = Eigen::Matrix<float, Eigen::Dynamic, Eigen::Dynamic, Eigen::RowMajor>;
+
+inline constexpr double kLayerNormEpsilon = 1e-5;  // torch.nn.LayerNorm's
+
+WeightFormat ParseWeightFormat(std::string_view text);  // "fp32", "16", "8"; else throws
 
 struct HeadSpec {
   std::string name;
@@ -43,6 +51,8 @@ struct NetworkSpec {
   int hidden = 0;
   bool residual = false;
   bool bidirectional = false;
+  bool layer_norm = false;  // layer >= 1 reads norm(its input); the residual path goes past the norm
+  WeightFormat format = WeightFormat::kFp32;
   std::vector<HeadSpec> heads;  // in the order of their names
 
   int lstm_input() const { return input_linear > 0 ? input_linear : input; }
@@ -55,6 +65,7 @@ class Manifest {
  public:
   static Manifest Load(const std::string& dir);
   static Manifest Parse(std::string_view text, const std::string& label);  // label: what errors call it
+  static Manifest Of(const std::string& name, const NetworkSpec& spec);    // one network, no file
 
   bool Has(const std::string& path) const;
   double Number(const std::string& path) const;
@@ -106,6 +117,8 @@ class WeightsFile {
  public:
   static WeightsFile Load(const std::string& dir);
   static WeightsFile Parse(std::vector<uint8_t> safetensors, Manifest manifest, const std::string& label);
+  // One network of this shape, called "net", with uniform weights in +-1/sqrt(hidden), torch's initial range.
+  static WeightsFile Random(const NetworkSpec& spec, unsigned seed);
 
   const std::string& label() const { return label_; }  // the folder, for messages
   const Manifest& manifest() const { return manifest_; }

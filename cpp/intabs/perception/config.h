@@ -32,7 +32,7 @@ struct PerceptionConfig {
   std::vector<CameraModel> cameras;  // at most kMaxCameras
   std::optional<GroundTag> ground;   // needed unless every camera has its X_WC
   std::vector<ObjectModel> objects;
-  double corner_sigma_px = 0.2;      // standard deviation of a tag corner's coordinate
+  double corner_sigma_px = 0.1;      // standard deviation of a tag corner's coordinate
 };
 
 // Throws std::runtime_error that names the field and its value: no camera, a tag or slot used twice, sizes <= 0, ...

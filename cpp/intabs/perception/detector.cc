@@ -7,8 +7,12 @@ extern "C" {
 
 #include <algorithm>
 #include <cmath>
+#include <cstdlib>
+#include <map>
 #include <stdexcept>
 #include <string>
+
+#include "intabs/perception/refine.h"
 
 namespace intabs {
 namespace {
@@ -18,7 +22,6 @@ constexpr double kHalfPixel = 0.5;
 // Two wrong bits of 36 may be mended; beyond that clutter starts to look like tags.
 constexpr int kMaxHamming = 1;
 constexpr float kMinDecisionMargin = 20;
-constexpr float kScanDecimation = 2;
 // Around a tag of the last frame: 0.5 m/s at 0.6 m is 20 px a frame at 25 Hz.
 constexpr int kMargin = 24;
 
@@ -57,6 +60,7 @@ struct TagDetector::Impl {
   std::vector<int> ids;
   apriltag_family_t* family = tag36h11_create();
   apriltag_detector_t* detector = apriltag_detector_create();
+  std::map<int, TagPattern> patterns;
   bool first = true;
   std::vector<SeenTag> seen;
   std::vector<SeenTag> last;
@@ -64,19 +68,30 @@ struct TagDetector::Impl {
   explicit Impl(std::vector<int> ids_in) : ids(std::move(ids_in)) {
     apriltag_detector_add_family_bits(detector, family, kMaxHamming);
     detector->nthreads = 1;
+    detector->quad_decimate = 1;
   }
   ~Impl() {
     apriltag_detector_destroy(detector);
     tag36h11_destroy(family);
   }
 
+  const TagPattern& Pattern(int id) {
+    const auto [at, is_new] = patterns.try_emplace(id);
+    if (is_new) {
+      image_u8_t* image = apriltag_to_image(family, id);
+      for (int k = 0; k < 100; ++k) at->second[k] = image->buf[k / 10 * image->stride + k % 10] > 127;
+      std::free(image->buf);
+      std::free(image);
+    }
+    return at->second;
+  }
+
   // Adds the tags found in one region of the image to `out`.
-  void Search(const cv::Mat& gray, cv::Rect region, float decimation, std::vector<SeenTag>& out) {
+  void Search(const cv::Mat& gray, cv::Rect region, std::vector<SeenTag>& out) {
     region &= cv::Rect(0, 0, gray.cols, gray.rows);
     if (region.width < 16 || region.height < 16) return;
     const cv::Mat part = gray(region);
     image_u8_t view = {part.cols, part.rows, static_cast<int32_t>(part.step), part.data};
-    detector->quad_decimate = decimation;
     zarray_t* found = apriltag_detector_detect(detector, &view);
     for (int i = 0; i < zarray_size(found); ++i) {
       apriltag_detection_t* d;
@@ -89,6 +104,7 @@ struct TagDetector::Impl {
       for (int k = 0; k < 4; ++k) {
         tag.corners[k] = {d->p[k][0] - kHalfPixel + region.x, d->p[k][1] - kHalfPixel + region.y};
       }
+      RefineCorners(gray, Pattern(tag.id), tag.corners);
       const auto same = std::find_if(out.begin(), out.end(), [&](const SeenTag& t) { return t.id == tag.id; });
       if (same == out.end()) {
         out.push_back(tag);
@@ -115,46 +131,33 @@ const std::vector<SeenTag>& TagDetector::Detect(const cv::Mat& gray, std::span<c
                              ", give 8-bit grey (CV_8UC1)");
   }
   const cv::Rect whole(0, 0, gray.cols, gray.rows);
-  const auto by_id = [](const SeenTag& a, const SeenTag& b) { return a.id < b.id; };
-  if (s.first) {
-    s.first = false;
-    s.Search(gray, whole, 1, s.seen);
-    std::sort(s.seen.begin(), s.seen.end(), by_id);
-    return s.seen;
-  }
-
   std::vector<cv::Rect> regions;
-  for (const cv::Rect& r : expected) {
-    if (!(r & whole).empty()) regions.push_back(r & whole);
-  }
-  const size_t n_expected = regions.size();
-  for (const SeenTag& tag : s.last) {
-    const bool covered = std::any_of(regions.begin(), regions.begin() + n_expected,
-                                     [&](const cv::Rect& r) { return Inside(tag.corners, r); });
-    if (!covered) regions.push_back(Around(tag.corners) & whole);
-  }
-  Merge(regions);
-  for (const cv::Rect& r : regions) s.Search(gray, r, 1, s.seen);
-
-  const auto has = [](const std::vector<SeenTag>& tags, int id) {
-    return std::any_of(tags.begin(), tags.end(), [&](const SeenTag& t) { return t.id == id; });
-  };
-  const bool lost = std::any_of(s.last.begin(), s.last.end(), [&](const SeenTag& t) { return !has(s.seen, t.id); });
-  if (lost || scan) {
-    std::vector<SeenTag> scanned;
-    s.Search(gray, whole, kScanDecimation, scanned);
-    for (const SeenTag& tag : scanned) {
-      if (has(s.seen, tag.id)) continue;
-      // The scan proposes, full resolution measures.
-      std::vector<SeenTag> measured;
-      s.Search(gray, Around(tag.corners), 1, measured);
-      for (const SeenTag& m : measured) {
-        if (!has(s.seen, m.id)) s.seen.push_back(m);
-      }
-      if (!has(s.seen, tag.id)) s.seen.push_back(tag);
+  if (s.first || scan) {
+    regions.push_back(whole);
+  } else {
+    for (const cv::Rect& r : expected) {
+      if (!(r & whole).empty()) regions.push_back(r & whole);
     }
+    const size_t n_expected = regions.size();
+    for (const SeenTag& tag : s.last) {
+      const bool covered = std::any_of(regions.begin(), regions.begin() + n_expected,
+                                       [&](const cv::Rect& r) { return Inside(tag.corners, r); });
+      if (!covered) regions.push_back(Around(tag.corners) & whole);
+    }
+    Merge(regions);
   }
-  std::sort(s.seen.begin(), s.seen.end(), by_id);
+  s.first = false;
+  for (const cv::Rect& r : regions) s.Search(gray, r, s.seen);
+
+  const auto is_seen = [&](const SeenTag& tag) {
+    return std::any_of(s.seen.begin(), s.seen.end(), [&](const SeenTag& t) { return t.id == tag.id; });
+  };
+  const bool lost = !std::all_of(s.last.begin(), s.last.end(), is_seen);
+  if (lost && !scan) {
+    s.seen.clear();
+    s.Search(gray, whole, s.seen);
+  }
+  std::sort(s.seen.begin(), s.seen.end(), [](const SeenTag& a, const SeenTag& b) { return a.id < b.id; });
   return s.seen;
 }
 

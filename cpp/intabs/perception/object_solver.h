@@ -29,7 +29,7 @@ struct ObjectFit {
 };
 
 struct ObjectSolverLimits {
-  double corner_sigma_px = 0.2;  // standard deviation of a corner coordinate, for the covariance
+  double corner_sigma_px = 0.1;  // standard deviation of a corner coordinate, for the covariance
   double max_rms_px = 1.0;       // more: the views contradict each other
   double max_ambiguity = 0.6;    // with one tag in one camera
 };

@@ -126,7 +126,7 @@ std::vector<cv::Rect> Pipeline::Expected(const Camera& camera, int64_t exposure_
   if (config_.ground) add(config_.ground->X_WT, config_.ground->size, kGroundMarginPx);
   for (const ObjectModel& o : config_.objects) {
     const Track& track = tracks_[o.slot];
-    if (!track.seen || exposure_us - track.seen_us > kHoldSeconds * 1e6) continue;
+    if (!track.seen || exposure_us - track.seen_us > kHoldUs) continue;
     for (const ObjectTag& t : o.tags) add(track.X_WO * t.X_OT, t.size, kObjectMarginPx);
   }
   return regions;
@@ -160,10 +160,7 @@ void Pipeline::Process(const GrayImages& images, int64_t frame_seq, int64_t expo
                                std::to_string(model.width) + " x " + std::to_string(model.height));
     }
   }
-  if (seq_ == 0 || exposure_us < last_us_) {
-    tracks_.fill({});
-    first_us_ = exposure_us;
-  }
+  if (seq_ == 0 || exposure_us < last_us_) tracks_.fill({});
   last_us_ = exposure_us;
   ++seq_;
 
@@ -226,7 +223,6 @@ void Pipeline::Process(const GrayImages& images, int64_t frame_seq, int64_t expo
   for (const ObjectModel& o : config_.objects) {
     Track& track = tracks_[o.slot];
     TrackedObject& object = out.objects[o.slot];
-    object.id = o.id;
     const ObjectFit fit = SolveObject(placed, std::move(views[o.slot]), limits);
     if (fit.valid) {
       track.X_WO = fit.X_WO;
@@ -238,10 +234,12 @@ void Pipeline::Process(const GrayImages& images, int64_t frame_seq, int64_t expo
     } else {
       ++track.missing_frames;
     }
+    if (!track.seen) continue;
+    object.id = o.id;
     object.X_WO = track.X_WO;
     object.covariance = track.covariance;
-    object.age = static_cast<float>(1e-6 * (exposure_us - (track.seen ? track.seen_us : first_us_)));
-    object.valid = track.seen && object.age <= kHoldSeconds;
+    object.age = static_cast<float>(1e-6 * (exposure_us - track.seen_us));
+    object.valid = exposure_us - track.seen_us <= kHoldUs;
   }
 }
 

@@ -22,17 +22,17 @@ using CameraDetections = std::array<TagDetections, kMaxCameras>;
 class Pipeline {
  public:
   // A pose stays valid for so long after the last frame that showed it: arm and fingers hide tags for moments.
-  static constexpr double kHoldSeconds = 0.5;
+  static constexpr int64_t kHoldUs = 500000;
   // The camera's place is the mean over so many frames of the ground tag, then fixed.
   static constexpr int kGroundFrames = 10;
 
   explicit Pipeline(PerceptionConfig config);  // throws what Check() throws
 
-  // out: every configured object in its slot.
+  // out: every configured object, in its slot.
   //   Seen: pose and covariance of this frame, cameras that contributed, age 0, valid.
   //   Not seen, or its views contradict each other: the last pose with age growing, cameras 0; valid up to an age of
-  //     kHoldSeconds, invalid after it (the pose is kept, the age grows on).
-  //   Never seen: null pose, invalid, age since the first frame.
+  //     kHoldUs, invalid after it (the pose is kept, the age grows on).
+  //   Never seen: as an unused slot (id -1, null pose, invalid, age 0).
   // A camera contributes once the ground tag showed where it stands, and not in a frame that shows the ground tag
   // elsewhere (moved camera, swapped cables).
   // detections: what each camera saw, at most kMaxTags each, sorted by id.
@@ -78,7 +78,6 @@ class Pipeline {
   std::vector<Camera> cameras_;
   std::array<Track, kMaxObjects> tracks_;
   int64_t seq_ = 0;
-  int64_t first_us_ = 0;
   int64_t last_us_ = 0;
 };
 

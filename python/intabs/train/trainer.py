@@ -140,7 +140,7 @@ class Trainer:
             self.step += 1
             self.seconds = time.monotonic() - began
             if self.step % 50 == 0 or self.step == total:
-                loss_value = float(loss)
+                loss_value = loss.item()
                 writer.add_scalar("train/loss", loss_value, self.step)
                 for k, v in terms.items():
                     writer.add_scalar(f"train/{k}", float(v), self.step)

@@ -69,7 +69,7 @@ void RoundTrip(Bus& bus) {
     INFO(channel.name);
     const M sent = Largest<M>();
     int received = 0;
-    bus.Subscribe<M>(channel, [&](const M& m) { received += Same(m, sent); });
+    bus.Subscribe(channel, [&](const M& m) { received += Same(m, sent); });
     REQUIRE(bus.Publish(channel, sent));
     HandleAll(bus, 1);
     CHECK(received == 1);
@@ -189,7 +189,7 @@ TEST_CASE("Garbage and truncated datagrams on every channel raise the counter an
       INFO(channel.name);
       int handled = 0;
       int undecodable = 0;
-      bus.Subscribe<M>(channel, [&](const M&) { ++handled; }, [&] { ++undecodable; });
+      bus.Subscribe(channel, [&](const M&) { ++handled; }, [&] { ++undecodable; });
       const auto good = Bytes(Largest<M>());
       for (int k = 0; k < 20; ++k) {
         std::vector<uint8_t> garbage(1 + random() % 1300);
@@ -216,17 +216,17 @@ TEST_CASE("Garbage and truncated datagrams on every channel raise the counter an
 TEST_CASE("After a backlog the newest message by seq is taken, once") {
   auto check = [](Bus& bus) {
     Newest<ArmCommand> newest;
-    bus.Subscribe<ArmCommand>(kLite6Command, [&](const ArmCommand& c) { newest.Offer(c); });
+    bus.Subscribe(kLite6Command, [&](const ArmCommand& c) { newest.Offer(c); });
     ArmCommand c;
-    for (int64_t seq = 1; seq <= 300; ++seq) {  // LCM's own default keeps the oldest 31
+    for (int64_t seq = 1; seq <= 100; ++seq) {  // LCM's own default keeps the oldest 31
       c.seq = seq;
       bus.Publish(kLite6Command, c);
     }
-    c.seq = 299;  // reordered
+    c.seq = 99;  // reordered
     bus.Publish(kLite6Command, c);
-    REQUIRE(HandleAll(bus, 301) == 301);
+    REQUIRE(HandleAll(bus, 101) == 101);
     REQUIRE(newest.Take(c));
-    CHECK(c.seq == 300);
+    CHECK(c.seq == 100);
     CHECK_FALSE(newest.Take(c));
     c.seq = 1;  // a restarted sender
     bus.Publish(kLite6Command, c);
@@ -246,7 +246,7 @@ TEST_CASE("A prefix separates two arms on one network") {
   LcmBus master(url, "MASTER_");
   LcmBus puppet(url, "PUPPET_");
   int heard = 0;
-  puppet.Subscribe<ArmStatus>(kLite6Status, [&](const ArmStatus&) { ++heard; });
+  puppet.Subscribe(kLite6Status, [&](const ArmStatus&) { ++heard; });
   master.Publish(kLite6Status, ArmStatus{});
   puppet.Publish(kLite6Status, ArmStatus{});
   while (puppet.Handle(200) > 0) {
@@ -256,7 +256,7 @@ TEST_CASE("A prefix separates two arms on one network") {
 
 TEST_CASE("What cannot work is said in one line") {
   CHECK_THROWS_WITH(LcmBus("udpm://10.0.0.1:7667"), Catch::Contains("10.0.0.1") && Catch::Contains("no multicast"));
-  CHECK_THROWS_WITH(LcmBus("nonsense://"), Catch::Contains("refuses the URL"));
+  CHECK_THROWS_WITH(LcmBus("nonsense://"), Catch::Contains("nonsense"));
   CHECK_THROWS_WITH(MemoryBus("A.*"), Catch::Contains("A.*"));
 }
 

@@ -5,6 +5,7 @@
 
 #include "common/alloc_hook.h"
 #include "intabs/nn/heads.h"
+#include "intabs/nn/lstm.h"
 #include "nn/random_weights.h"
 
 using namespace intabs;

@@ -142,7 +142,7 @@ TEST_CASE("Frames without tags give invalid objects with a null pose, never a gu
   for (const GrayImages& images : {GrayImages{black, black}, world.See({}), GrayImages{cv::Mat(), cv::Mat()}}) {
     pipeline.Process(images, 1, t += kFrameUs, poses, seen);
     for (int o = 0; o < 2; ++o) {
-      CHECK(poses.objects[o].id == o);
+      CHECK(poses.objects[o].id == -1);
       CHECK_FALSE(poses.objects[o].valid);
       CHECK(poses.objects[o].X_WO.p.norm() == 0);
     }

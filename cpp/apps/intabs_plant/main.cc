@@ -1,0 +1,55 @@
+// intabs_plant: MuJoCo behind the channels of the arm.
+#include <CLI/CLI.hpp>
+#include <iostream>
+
+#include "common/yaml_config.h"
+#include "intabs/rt/stop_signal.h"
+#include "intabs_plant/options.h"
+#include "intabs_plant/plant.h"
+
+namespace intabs {
+namespace {
+
+int Main(int argc, char** argv) {
+  PlantOptions o;
+  CLI::App app{"The simulated arm with its table and cameras: LITE6_COMMAND in; LITE6_STATUS, PLANT_TRUTH and frames out."};
+  AddYamlConfig(app);
+  app.add_option("--task", o.task, "what stands on the table and what counts as success")->capture_default_str();
+  app.add_option("--seed", o.seed, "where the objects stand")->capture_default_str();
+  app.add_option("--spread", o.spread, "how far from their nominal places at most, cm")
+      ->check(CLI::Range(0.0, 100.0))
+      ->capture_default_str();
+  app.add_option("--clock", o.clock, "lockstep: simulation waits for each command; wall: nobody waits")
+      ->check(CLI::IsMember({"lockstep", "wall"}))
+      ->capture_default_str();
+  app.add_option("--lcm", o.lcm, "LCM URL")->capture_default_str();
+  app.add_option("--prefix", o.prefix, "comes before every channel's name");
+  app.add_option("--models", o.models, "folder with scenes, objects and the arm")->capture_default_str();
+  app.add_flag("--cameras,!--no-cameras", o.cameras, "write camera frames into the ring (default)");
+  app.add_option("--ring", o.ring, "name of the frames' shared memory")->capture_default_str();
+  app.add_option("--video", o.video, "write a video, FILE.mp4");
+  app.add_option("--strip", o.strip, "write a strip of pictures of the run, FILE.png");
+  app.add_flag("--viewer", o.viewer, "open a window");
+  app.add_option("--json", o.json, "write the figures there at the end");
+  try {
+    app.parse(argc, argv);
+  } catch (const CLI::ParseError& e) {
+    if (e.get_exit_code() == 0) return app.exit(e);
+    std::cerr << "intabs_plant: " << e.what() << " (see --help)\n";
+    return 1;
+  }
+  InstallStopSignals();
+  try {
+    Plant plant(o);
+    plant.Run();
+  } catch (const std::exception& e) {
+    std::cerr << "intabs_plant: " << e.what() << "\n";
+    return 1;
+  }
+  return 0;
+}
+
+}  // namespace
+}  // namespace intabs
+
+int main(int argc, char** argv) { return intabs::Main(argc, argv); }

@@ -1,0 +1,77 @@
+#include <pybind11/eigen.h>
+#include <pybind11/numpy.h>
+#include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
+
+#include "intabs/plant/renderer.h"
+#include "intabs/plant/world.h"
+
+namespace py = pybind11;
+
+namespace intabs {
+
+void Bind_plant(py::module_& m) {
+  py::class_<World>(m, "World", "MuJoCo world of one task; deterministic. One thread at a time.")
+      .def(py::init<const std::string&, const std::string&>(), py::arg("models_dir"), py::arg("task"),
+           "Loads models_dir/scenes/<task>.xml. RuntimeError on an unknown task or a broken scene.")
+      .def("reset", &World::Reset, py::arg("seed"), py::arg("spread_cm"), py::call_guard<py::gil_scoped_release>(),
+           "Time zero, arm at home, objects placed by the seed.")
+      .def(
+          "step",
+          [](World& w, const JointVector& q, const JointVector& dq, bool gripper_closed, int ticks) {
+            py::gil_scoped_release release;
+            for (int i = 0; i < ticks; ++i) w.Step({q, dq, gripper_closed});
+          },
+          py::arg("q"), py::arg("dq"), py::arg("gripper_closed"), py::arg("ticks") = 1,
+          "Driver ticks of 4 ms towards q (6,) rad with feed-forward dq (6,) rad/s.")
+      .def_property_readonly("time_us", &World::time_us)
+      .def(
+          "arm",
+          [](const World& w) {
+            const ArmMeasurement a = w.Arm();
+            py::dict d;
+            d["q"] = a.q;
+            d["dq"] = a.dq;
+            d["tau"] = a.tau;
+            d["gripper_opening"] = a.gripper_opening;
+            return d;
+          },
+          "q [rad], dq [rad/s], tau [Nm], each (6,); gripper_opening [m].")
+      .def(
+          "objects",
+          [](const World& w) {
+            py::dict d;
+            for (const TrackedObject& o : w.Objects()) {
+              if (o.id < 0) continue;
+              Eigen::Matrix<double, 7, 1> pose;
+              pose << o.X_WO.p, o.X_WO.q.w(), o.X_WO.q.x(), o.X_WO.q.y(), o.X_WO.q.z();
+              d[py::int_(o.id)] = pose;
+            }
+            return d;
+          },
+          "{id: p_WO [m] and q_WO wxyz (7,)}: the truth.")
+      .def_property_readonly("success", &World::Success)
+      .def_property_readonly("subgoals", &World::Subgoals)
+      .def_property_readonly("subgoal_names", &World::SubgoalNames)
+      .def_property_readonly("failure_reason", &World::FailureReason)
+      .def_property_readonly("state_hash", &World::StateHash);
+
+  py::class_<Renderer>(m, "Renderer", "Pictures of a World without a window.")
+      .def(py::init<const World&, int, int>(), py::arg("world"), py::arg("width") = 640, py::arg("height") = 480)
+      .def(
+          "render",
+          [](Renderer& r, const World& world, const std::string& camera, int width, int height) {
+            Snapshot s;
+            world.Save(s);
+            py::array_t<uint8_t> rgb({height, width, 3});
+            uint8_t* out = rgb.mutable_data();
+            const int id = r.FindCamera(camera);
+            py::gil_scoped_release release;
+            r.Render(s, id, out);
+            return rgb;
+          },
+          py::arg("world"), py::arg("camera"), py::arg("width") = 640, py::arg("height") = 480,
+          "(H, W, 3) uint8 RGB; width and height must be those of the renderer.");
+}
+
+}  // namespace intabs

@@ -1,0 +1,391 @@
+// The kernels, written once over a 16-lane vector type V. Each kernels_<isa>.cc includes this file inside an anonymous
+// namespace, after its V, and is compiled with flags of its own: so nothing here may use anything from a header that
+// another file could share (an inline function compiled for AVX-512 must not be the one that the linker keeps).
+//
+// V has: F (16 floats), Load, Store, Set1, Zero, Add, Sub, Mul, Div, Fma (a b + c), Min, Max (the second argument where
+// one is NaN), Abs, MaxLane, Exponent (float whose bits are those of its argument shifted left by 23, plus 1.0's),
+// LowHalf, HighHalf (of 16 words of two bf16, as floats), Prefetch, kTileGates, kTileCols (what fits the registers).
+// For 8 bit: kHasDot8; I (16 int32), IZero, ISet1, kMaxDotRows, Quantise, Dot8, FromDot8. For bf16 products: kHasDot16,
+// ToPairs, Dot16.
+
+#define INTABS_UNROLL _Pragma("GCC unroll 16")
+#define INTABS_INLINE inline __attribute__((always_inline))
+
+template <class V>
+struct Impl {
+  using F = typename V::F;
+  using I = typename V::I;
+
+  // -------------------------------------------------------------------------------------------------- activations
+  // exp(r) - 1 on |r| <= ln(2)/2, and n, t with x = n ln 2 + r; 2^n = V::Exponent(t). Cody-Waite reduction and the
+  // polynomial of Cephes' expf.
+  static INTABS_INLINE F ExpM1Reduced(F x, F* n, F* t) {
+    const F magic = V::Set1(12582912.0f);  // 1.5 * 2^23: adding it rounds to a whole number, in the low bits
+    *t = V::Fma(x, V::Set1(1.44269504088896341f), magic);
+    *n = V::Sub(*t, magic);
+    F r = V::Fma(*n, V::Set1(-0.693359375f), x);
+    r = V::Fma(*n, V::Set1(2.12194440e-4f), r);
+    F p = V::Set1(1.9875691500e-4f);
+    p = V::Fma(p, r, V::Set1(1.3981999507e-3f));
+    p = V::Fma(p, r, V::Set1(8.3334519073e-3f));
+    p = V::Fma(p, r, V::Set1(4.1665795894e-2f));
+    p = V::Fma(p, r, V::Set1(1.6666665459e-1f));
+    p = V::Fma(p, r, V::Set1(5.0000001201e-1f));
+    return V::Fma(V::Mul(p, r), r, r);
+  }
+  // NaN passes: Min and Max return their second argument then.
+  static INTABS_INLINE F Clamp(F x, float low, float high) { return V::Max(V::Set1(low), V::Min(V::Set1(high), x)); }
+
+  // Over the whole range: overflows to infinity, underflows gradually (2^n in two factors).
+  static INTABS_INLINE F Exp(F x) {
+    F n, t;
+    const F e = V::Add(ExpM1Reduced(Clamp(x, -105.0f, 90.0f), &n, &t), V::Set1(1.0f));
+    const F magic = V::Set1(12582912.0f);
+    const F t1 = V::Fma(n, V::Set1(0.5f), magic);
+    const F n2 = V::Sub(n, V::Sub(t1, magic));
+    return V::Mul(V::Mul(e, V::Exponent(t1)), V::Exponent(V::Add(n2, magic)));
+  }
+  static INTABS_INLINE F Sigmoid(F x) {  // 1 / (1 + exp(-x))
+    F n, t;
+    const F p = ExpM1Reduced(V::Sub(V::Zero(), Clamp(x, -87.5f, 87.5f)), &n, &t);
+    const F s = V::Exponent(t);
+    return V::Div(V::Set1(1.0f), V::Add(V::Fma(p, s, s), V::Set1(1.0f)));
+  }
+  static INTABS_INLINE F Tanh(F x) {  // E / (E + 2), E = exp(2x) - 1 without cancellation
+    F n, t;
+    const F p = ExpM1Reduced(Clamp(V::Add(x, x), -20.0f, 20.0f), &n, &t);
+    const F s = V::Exponent(t);
+    const F e = V::Fma(p, s, V::Sub(s, V::Set1(1.0f)));
+    return V::Div(e, V::Add(e, V::Set1(2.0f)));
+  }
+  static INTABS_INLINE void Activate(const F* g, float* c, float* h_new) {
+    const F c_new = V::Fma(Sigmoid(g[1]), V::Load(c), V::Mul(Sigmoid(g[0]), Tanh(g[2])));
+    V::Store(c, c_new);
+    V::Store(h_new, V::Mul(Sigmoid(g[3]), Tanh(c_new)));
+  }
+
+  template <F (*Function)(F)>
+  static void Map(const float* x, float* y, int n) noexcept {
+    alignas(64) float in[16], out[16];
+    for (int i = 0; i < n; i += 16) {
+      const int m = n - i < 16 ? n - i : 16;
+      for (int k = 0; k < 16; ++k) in[k] = k < m ? x[i + k] : 0.0f;
+      V::Store(out, Function(V::Load(in)));
+      for (int k = 0; k < m; ++k) y[i + k] = out[k];
+    }
+  }
+
+  // ------------------------------------------------------------------------------- one column: a stream of weights
+  // Ahead of the loads, in bytes; crosses panels and layers, so that memory stays busy while gates are computed.
+  static constexpr int kAhead = 4096;
+  template <bool kFetch>
+  static INTABS_INLINE void Fetch(const char* p) {
+    if constexpr (kFetch) V::Prefetch(p + kAhead);
+  }
+
+  // acc[0..3], more[0..3] += W x; returns the end of W.
+  template <bool kFetch>
+  static INTABS_INLINE const char* Fp32Rows(const char* w, const float* x, int n, F* acc, F* more) {
+    int k = 0;
+    for (; k + 2 <= n; k += 2, w += 512) {
+      const F x0 = V::Set1(x[k]), x1 = V::Set1(x[k + 1]);
+      INTABS_UNROLL for (int g = 0; g < 4; ++g) {
+        Fetch<kFetch>(w + 64 * g);
+        acc[g] = V::Fma(V::Load(w + 64 * g), x0, acc[g]);
+      }
+      F* second = V::kTwoSets ? more : acc;
+      INTABS_UNROLL for (int g = 0; g < 4; ++g) {
+        Fetch<kFetch>(w + 256 + 64 * g);
+        second[g] = V::Fma(V::Load(w + 256 + 64 * g), x1, second[g]);
+      }
+    }
+    if (k < n) {
+      INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Fma(V::Load(w + 64 * g), V::Set1(x[k]), acc[g]);
+      w += 256;
+    }
+    return w;
+  }
+  template <bool kFetch>
+  static INTABS_INLINE const char* Bf16Rows(const char* w, const float* x, int n, F* acc, F* more) {
+    F* second = V::kTwoSets ? more : acc;
+    for (int k = 0; k < n; k += 2, w += 256) {
+      const F x0 = V::Set1(x[k]), x1 = V::Set1(x[k + 1]);
+      INTABS_UNROLL for (int g = 0; g < 4; ++g) {
+        Fetch<kFetch>(w + 64 * g);
+        acc[g] = V::Fma(V::LowHalf(w + 64 * g), x0, acc[g]);
+        second[g] = V::Fma(V::HighHalf(w + 64 * g), x1, second[g]);
+      }
+    }
+    return w;
+  }
+  // g[0..3] += scale * (W x), x as two arrays of words from V::Quantise. `sums` is 128 * (sum of each row of W).
+  template <bool kFetch>
+  static INTABS_INLINE const char* Int8Rows(const char* w, const uint32_t* a, const uint32_t* b, int rows, float x_scale,
+                                            const char* scale, const char* sums, F* g) {
+    for (int r = 0; r < rows;) {
+      I high[4], low[4];
+      INTABS_UNROLL for (int i = 0; i < 4; ++i) high[i] = low[i] = V::IZero();
+      const int end = r + V::kMaxDotRows < rows ? r + V::kMaxDotRows : rows;
+      const bool first = r == 0;
+      for (; r < end; ++r, w += 256) {
+        const I x0 = V::ISet1(a[r]), x1 = V::ISet1(b[r]);
+        INTABS_UNROLL for (int i = 0; i < 4; ++i) {
+          Fetch<kFetch>(w + 64 * i);
+          V::Dot8(w + 64 * i, x0, x1, &high[i], &low[i]);
+        }
+      }
+      INTABS_UNROLL for (int i = 0; i < 4; ++i) {
+        const F dot = V::FromDot8(high[i], low[i], sums + 64 * i, first);
+        g[i] = V::Fma(V::Mul(dot, V::Set1(x_scale)), V::Load(scale + 64 * i), g[i]);
+      }
+    }
+    return w;
+  }
+  // The same without integer products: fp32 inputs, weights widened to float.
+  static INTABS_INLINE const char* Int8RowsFloat(const char* w, const float* x, int n, const char* scale, F* g) {
+    F acc[4];
+    INTABS_UNROLL for (int i = 0; i < 4; ++i) acc[i] = V::Zero();
+    for (int k = 0; k < n; k += 4, w += 256) {
+      INTABS_UNROLL for (int i = 0; i < 4; ++i) {
+        acc[i] = V::Fma(V::template Byte<0>(w + 64 * i), V::Set1(x[k]), acc[i]);
+        acc[i] = V::Fma(V::template Byte<1>(w + 64 * i), V::Set1(x[k + 1]), acc[i]);
+        acc[i] = V::Fma(V::template Byte<2>(w + 64 * i), V::Set1(x[k + 2]), acc[i]);
+        acc[i] = V::Fma(V::template Byte<3>(w + 64 * i), V::Set1(x[k + 3]), acc[i]);
+      }
+    }
+    INTABS_UNROLL for (int i = 0; i < 4; ++i) g[i] = V::Fma(acc[i], V::Load(scale + 64 * i), g[i]);
+    return w;
+  }
+
+  // x in the words that int8 products take: two arrays, and the scale that undoes it. 0 for x = 0.
+  static INTABS_INLINE float Quantise(const float* x, int n, uint32_t* a, uint32_t* b) {
+    F largest = V::Zero();
+    for (int k = 0; k < n; k += 16) largest = V::Max(largest, V::Abs(V::Load(x + k)));
+    const float top = V::MaxLane(largest);
+    const F scale = V::Set1(top > 0 ? 32767.0f / top : 0.0f);
+    for (int k = 0; k < n; k += 16) V::Quantise(V::Mul(V::Load(x + k), scale), a + k / 4, b + k / 4);
+    return top * (1.0f / 32767.0f);
+  }
+
+  template <bool kBoth>  // both products, or W_hh alone with `gates` in place of the bias
+  static INTABS_INLINE void StepAny(const Cell& cell, const float* x, const float* gates, const float* h, float* h_new,
+                                    float* c, void* scratch) {
+    const int hidden = cell.hidden, input = kBoth ? cell.input : 0;
+    const char* panel = cell.data;
+    const size_t panel_bytes = cell.panel_bytes;
+    uint32_t *ha = nullptr, *hb = nullptr, *xa = nullptr, *xb = nullptr;
+    float h_scale = 0, x_scale = 0;
+    if constexpr (V::kHasDot8) {
+      if (cell.format == WeightFormat::k8) {
+        const int hw = RoundUp(hidden, 16) / 4, xw = RoundUp(input, 16) / 4;
+        ha = static_cast<uint32_t*>(scratch), hb = ha + hw, xa = hb + hw, xb = xa + xw;
+        h_scale = Quantise(h, hidden, ha, hb);
+        if (kBoth) x_scale = Quantise(x, input, xa, xb);
+      }
+    }
+    for (int p = 0; p < cell.panels; ++p, panel += panel_bytes, c += 16, h_new += 16) {
+      const char* w = panel + 256;
+      const char* start = kBoth ? panel : reinterpret_cast<const char*>(gates + 64 * p);
+      F acc[4], more[4];
+      INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Load(start + 64 * g), more[g] = V::Zero();
+      if (cell.format == WeightFormat::kFp32) {
+        w = Fp32Rows<kBoth>(w, h, hidden, acc, more);
+        if (kBoth) Fp32Rows<true>(w, x, input, acc, more);
+      } else if (cell.format == WeightFormat::k16) {
+        w = Bf16Rows<kBoth>(w, h, hidden, acc, more);
+        if (kBoth) Bf16Rows<true>(w, x, input, acc, more);
+      } else {
+        const char *hs = w, *xs = w + 256, *h_sums = w + 512, *x_sums = w + 768;
+        w += 1024;
+        if constexpr (V::kHasDot8) {
+          w = Int8Rows<kBoth>(w, ha, hb, cell.h_rows, h_scale, hs, h_sums, acc);
+          if (kBoth) Int8Rows<true>(w, xa, xb, cell.x_rows, x_scale, xs, x_sums, acc);
+        } else {
+          w = Int8RowsFloat(w, h, hidden, hs, acc);
+          if (kBoth) Int8RowsFloat(w, x, input, xs, acc);
+        }
+      }
+      if (V::kTwoSets && cell.format != WeightFormat::k8) {
+        INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Add(acc[g], more[g]);
+      }
+      Activate(acc, c, h_new);
+    }
+  }
+  static void Step(const Cell& cell, const float* x, const float* h, float* h_new, float* c, void* scratch) noexcept {
+    StepAny<true>(cell, x, nullptr, h, h_new, c, scratch);
+  }
+  static void StepFromGates(const Cell& cell, const float* gates, const float* h, float* h_new, float* c,
+                            void* scratch) noexcept {
+    StepAny<false>(cell, nullptr, gates, h, h_new, c, scratch);
+  }
+
+  // ---------------------------------------------------------------------- many columns: register tiles of G += W X
+  // One part (W_hh or W_ih) of one panel against n columns. G: 64 floats a column, `ldg` floats apart.
+
+  // Columns as a part's product takes them, made once for all panels.
+  struct Columns {
+    const char* a = nullptr;     // fp32 values, bf16 pairs, or the first words of V::Quantise
+    const char* b = nullptr;     // the second words
+    const float* scale = nullptr;
+    ptrdiff_t ld = 0;            // bytes from column to column
+  };
+  static size_t ScratchBytes(int length, int n) {
+    // Two parts (h and x) of two arrays of words and a scale a column.
+    return 2 * static_cast<size_t>(n) * (2 * static_cast<size_t>(RoundUp(length, 16)) + 64) + 128;
+  }
+  static Columns Prepare(WeightFormat format, const float* X, ptrdiff_t ld, int length, int n, char** scratch) {
+    Columns out{reinterpret_cast<const char*>(X), nullptr, nullptr, 4 * ld};
+    const int padded = RoundUp(length, 16);
+    if constexpr (V::kHasDot16) {
+      if (format == WeightFormat::k16) {
+        char* a = *scratch;
+        out.ld = 2 * padded;
+        for (int j = 0; j < n; ++j) {
+          for (int k = 0; k < padded; k += 16) V::ToPairs(X + j * ld + k, a + j * out.ld + 2 * k);
+        }
+        out.a = a;
+        *scratch = a + n * out.ld;
+      }
+    }
+    if constexpr (V::kHasDot8) {
+      if (format == WeightFormat::k8) {
+        out.ld = padded;
+        char *a = *scratch, *b = a + n * out.ld;
+        float* scale = reinterpret_cast<float*>(b + n * out.ld);
+        for (int j = 0; j < n; ++j) {
+          scale[j] = Quantise(X + j * ld, length, reinterpret_cast<uint32_t*>(a + j * out.ld),
+                              reinterpret_cast<uint32_t*>(b + j * out.ld));
+        }
+        out.a = a, out.b = b, out.scale = scale;
+        *scratch = reinterpret_cast<char*>(scale + RoundUp(n, 16));
+      }
+    }
+    return out;
+  }
+
+  template <int kGates, int kCols>
+  static INTABS_INLINE void TileFp32(const char* w, int n, const char* x, ptrdiff_t ld, float* G, ptrdiff_t ldg) {
+    F acc[kCols][kGates];
+    INTABS_UNROLL for (int j = 0; j < kCols; ++j)
+      INTABS_UNROLL for (int g = 0; g < kGates; ++g) acc[j][g] = V::Load(G + j * ldg + 16 * g);
+    for (int k = 0; k < n; ++k, w += 256) {
+      F v[kGates];
+      INTABS_UNROLL for (int g = 0; g < kGates; ++g) v[g] = V::Load(w + 64 * g);
+      INTABS_UNROLL for (int j = 0; j < kCols; ++j) {
+        const F b = V::Set1(reinterpret_cast<const float*>(x + j * ld)[k]);
+        INTABS_UNROLL for (int g = 0; g < kGates; ++g) acc[j][g] = V::Fma(v[g], b, acc[j][g]);
+      }
+    }
+    INTABS_UNROLL for (int j = 0; j < kCols; ++j)
+      INTABS_UNROLL for (int g = 0; g < kGates; ++g) V::Store(G + j * ldg + 16 * g, acc[j][g]);
+  }
+  template <int kGates, int kCols>
+  static INTABS_INLINE void TileBf16(const char* w, int n, const char* x, ptrdiff_t ld, float* G, ptrdiff_t ldg) {
+    F acc[kCols][kGates];
+    INTABS_UNROLL for (int j = 0; j < kCols; ++j)
+      INTABS_UNROLL for (int g = 0; g < kGates; ++g) acc[j][g] = V::Load(G + j * ldg + 16 * g);
+    for (int k = 0; k < n; k += 2, w += 256) {
+      if constexpr (V::kHasDot16) {
+        INTABS_UNROLL for (int j = 0; j < kCols; ++j) {
+          const I b = V::ISet1(reinterpret_cast<const uint32_t*>(x + j * ld)[k / 2]);
+          INTABS_UNROLL for (int g = 0; g < kGates; ++g) acc[j][g] = V::Dot16(w + 64 * g, b, acc[j][g]);
+        }
+      } else {
+        F low[kGates], high[kGates];
+        INTABS_UNROLL for (int g = 0; g < kGates; ++g) low[g] = V::LowHalf(w + 64 * g), high[g] = V::HighHalf(w + 64 * g);
+        INTABS_UNROLL for (int j = 0; j < kCols; ++j) {
+          const float* xj = reinterpret_cast<const float*>(x + j * ld);
+          const F b0 = V::Set1(xj[k]), b1 = V::Set1(xj[k + 1]);
+          INTABS_UNROLL for (int g = 0; g < kGates; ++g) {
+            acc[j][g] = V::Fma(high[g], b1, V::Fma(low[g], b0, acc[j][g]));
+          }
+        }
+      }
+    }
+    INTABS_UNROLL for (int j = 0; j < kCols; ++j)
+      INTABS_UNROLL for (int g = 0; g < kGates; ++g) V::Store(G + j * ldg + 16 * g, acc[j][g]);
+  }
+  // n columns with the given tile, then what is left one by one.
+  template <bool kBf16, int kGates, int kCols>
+  static INTABS_INLINE void Tiles(const char* w, int length, const Columns& x, int n, float* G, ptrdiff_t ldg) {
+    for (int g = 0; g < 4; g += kGates) {
+      int j = 0;
+      for (; j + kCols <= n; j += kCols) {
+        if constexpr (kBf16) {
+          TileBf16<kGates, kCols>(w + 64 * g, length, x.a + j * x.ld, x.ld, G + j * ldg + 16 * g, ldg);
+        } else {
+          TileFp32<kGates, kCols>(w + 64 * g, length, x.a + j * x.ld, x.ld, G + j * ldg + 16 * g, ldg);
+        }
+      }
+      for (; j < n; ++j) {
+        if constexpr (kBf16) {
+          TileBf16<kGates, 1>(w + 64 * g, length, x.a + j * x.ld, x.ld, G + j * ldg + 16 * g, ldg);
+        } else {
+          TileFp32<kGates, 1>(w + 64 * g, length, x.a + j * x.ld, x.ld, G + j * ldg + 16 * g, ldg);
+        }
+      }
+    }
+  }
+  static void Part(WeightFormat format, const char* w, int length, int rows, const Columns& x, int n, const char* scale,
+                   const char* sums, float* G, ptrdiff_t ldg) {
+    if (format == WeightFormat::kFp32) {
+      Tiles<false, V::kTileGates, V::kTileCols>(w, length, x, n, G, ldg);
+    } else if (format == WeightFormat::k16) {
+      Tiles<true, V::kTileGates, V::kTileCols>(w, length, x, n, G, ldg);
+    } else {
+      for (int j = 0; j < n; ++j) {
+        F acc[4];
+        INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Load(G + j * ldg + 16 * g);
+        const char *a = x.a + j * x.ld, *b = x.b + j * x.ld;
+        if constexpr (V::kHasDot8) {
+          Int8Rows<false>(w, reinterpret_cast<const uint32_t*>(a), reinterpret_cast<const uint32_t*>(b), rows, x.scale[j],
+                   scale, sums, acc);
+        } else {
+          Int8RowsFloat(w, reinterpret_cast<const float*>(a), length, scale, acc);
+        }
+        INTABS_UNROLL for (int g = 0; g < 4; ++g) V::Store(G + j * ldg + 16 * g, acc[g]);
+      }
+    }
+  }
+  static INTABS_INLINE void Fill(const char* row, int n, float* G, ptrdiff_t ldg) {
+    F v[4];
+    INTABS_UNROLL for (int g = 0; g < 4; ++g) v[g] = V::Load(row + 64 * g);
+    for (int j = 0; j < n; ++j) {
+      INTABS_UNROLL for (int g = 0; g < 4; ++g) V::Store(G + j * ldg + 16 * g, v[g]);
+    }
+  }
+
+  static void InputGates(const Cell& cell, const float* X, ptrdiff_t ld, int n, float* gates, void* scratch) noexcept {
+    const char* panel = cell.data;
+    char* room = static_cast<char*>(scratch);
+    const Columns x = Prepare(cell.format, X, ld, cell.input, n, &room);
+    const ptrdiff_t ldg = 64 * static_cast<ptrdiff_t>(cell.panels);
+    for (int p = 0; p < cell.panels; ++p, panel += cell.panel_bytes, gates += 64) {
+      const char* w = panel + 256 * (cell.header_rows + cell.h_rows);
+      Fill(panel, n, gates, ldg);
+      Part(cell.format, w, cell.input, cell.x_rows, x, n, panel + 512, panel + 1024, gates, ldg);
+    }
+  }
+  static void Batch(const Cell& cell, const float* X, ptrdiff_t ldx, const float* H, float* H_new, float* C,
+                    ptrdiff_t ldh, int n, float* gates, void* scratch) noexcept {
+    const char* panel = cell.data;
+    char* room = static_cast<char*>(scratch);
+    const Columns h = Prepare(cell.format, H, ldh, cell.hidden, n, &room);
+    const Columns x = Prepare(cell.format, X, ldx, cell.input, n, &room);
+    for (int p = 0; p < cell.panels; ++p, panel += cell.panel_bytes, C += 16, H_new += 16) {
+      const char* w = panel + 256 * cell.header_rows;
+      Fill(panel, n, gates, 64);
+      Part(cell.format, w, cell.hidden, cell.h_rows, h, n, panel + 256, panel + 768, gates, 64);
+      w += 256 * cell.h_rows;
+      Part(cell.format, w, cell.input, cell.x_rows, x, n, panel + 512, panel + 1024, gates, 64);
+      for (int j = 0; j < n; ++j) {
+        F g[4];
+        INTABS_UNROLL for (int i = 0; i < 4; ++i) g[i] = V::Load(gates + 64 * j + 16 * i);
+        Activate(g, C + j * ldh, H_new + j * ldh);
+      }
+    }
+  }
+
+  static constexpr Kernels kTable = {&ScratchBytes, &Step,     &InputGates, &StepFromGates,
+                                     &Batch,        &Map<Exp>, &Map<Tanh>,  &Map<Sigmoid>};
+};

@@ -1,0 +1,28 @@
+"""`intabs export`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from intabs.errors import UserError
+from intabs.output import write_json
+
+
+def register(app: typer.Typer) -> None:
+    @app.command()
+    def export(
+        run: Annotated[Path, typer.Argument(help="Folder of a training run.")],
+        out: Annotated[Path, typer.Option(help="Weights folder to write, e.g. models/weights/NAME.")],
+        json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
+    ) -> None:
+        """Write weights, manifest, golden vectors and plans; load them in C++ and compare before it counts as done."""
+        try:
+            from intabs.train.export import export as write
+        except ModuleNotFoundError as e:
+            raise UserError(f"{e.name} is not installed: run tools/setup (without --runtime-only)") from None
+        figures = write(run, out)
+        write_json(json, figures)
+        print(f"{out}: {figures['tensors']} tensors, C++ within {figures['max_abs_error']:.1e} of torch")

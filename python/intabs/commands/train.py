@@ -1,0 +1,52 @@
+"""`intabs train`."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from intabs.errors import UserError
+from intabs.output import Progress, write_json
+
+
+class Device(StrEnum):
+    cpu = "cpu"
+    cuda = "cuda"
+
+
+def register(app: typer.Typer) -> None:
+    @app.command()
+    def train(
+        config: Annotated[str, typer.Option(help="intabs, intabs-small, or a YAML file of that form.")],
+        data: Annotated[Path, typer.Option(help="Demonstrations, HDF5.")],
+        out: Annotated[Path, typer.Option(help="Folder of the run: checkpoint, TensorBoard curves, result.json.")],
+        set_: Annotated[
+            list[str] | None, typer.Option("--set", help="Change a setting, e.g. train.steps=2000. Repeatable.")
+        ] = None,
+        resume: Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint in --out.")] = False,
+        device: Annotated[Device, typer.Option(help="Where to compute.")] = Device.cpu,
+        seed: Annotated[int, typer.Option(help="Of initial weights, batches and noise.", min=0)] = 0,
+        json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
+    ) -> None:
+        """Train encoders and policy by segment pretraining; held-out demonstrations are scored on the way."""
+        try:
+            import torch
+        except ImportError:
+            raise UserError("torch is not installed: run tools/setup (without --runtime-only)") from None
+        from intabs.train.trainer import Trainer, load_config
+
+        if device is Device.cuda and not torch.cuda.is_available():
+            raise UserError("--device cuda: torch sees no GPU here; leave it out")
+        trainer = Trainer(load_config(config, set_ or []), data, out, seed, device.value)
+        if resume:
+            trainer.resume()
+        elif trainer.path.exists():
+            raise UserError(f"{trainer.path} is there already: add --resume, or give another --out")
+        with Progress("train", total=trainer.config["train"]["steps"]) as progress:
+            figures = trainer.train(progress.update)
+        write_json(json, figures)
+        valid = ", ".join(f"{k} {v:.4f}" for k, v in figures["valid"].items())
+        print(f"{out}: {figures['steps']} steps in {figures['seconds']:.0f} s, loss {figures['loss']:.4f}; held out: {valid}")

@@ -1,0 +1,102 @@
+"""Whoever dies in mid-motion: the arm slows down and holds, the status says why, a new session takes over."""
+
+import math
+import signal
+
+import pytest
+
+from bench import FAULT, HOLDING, SLOWING, STALE_COMMAND, TRACKING, Bench, need_programs
+from intabs import messages
+
+need_programs()
+STALE_POSES = 4  # skills/skill_player.h EndReason
+
+
+@pytest.fixture
+def moving(tmp_path):
+    """All programs in real time, the arm in motion."""
+    with Bench(tmp_path) as bench:
+        bench.start_all()
+        bench.play()
+        bench.until(lambda: bench.status.state == TRACKING and speed(bench.status) > 0.1, "the arm moves")
+        yield bench
+
+
+def speed(status) -> float:
+    return math.sqrt(sum(v * v for v in status.dq))
+
+
+def kill(process) -> None:
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+def assert_slowed_down_and_holds(bench, killed_at: int) -> None:
+    """No jump on the way down, then no motion."""
+    statuses = bench.heard["LITE6_STATUS"][killed_at:]
+    # 20 rad/s^2 is the filter's limit: .08 rad/s a tick of 4 ms; LCM may have lost a status.
+    for before, after in zip(statuses, statuses[1:], strict=False):
+        ticks = max(1, round((after.utime - before.utime) / 4000))
+        for a, b in zip(before.q_commanded, after.q_commanded, strict=True):
+            assert abs(b - a) <= 2.2 * 0.004 * ticks
+    held = bench.status.q_commanded
+    bench.listen(0.5)
+    assert bench.status.q_commanded == held
+    assert speed(bench.status) < 0.02
+
+
+def test_control_killed_in_mid_motion_then_a_new_one_takes_over(moving):
+    bench = moving
+    old_session, killed_at = bench.status.session, len(bench.heard["LITE6_STATUS"])
+    kill(bench.processes.running.pop("intabs_control"))
+    bench.until(lambda: bench.status.state == HOLDING, "the arm holds", patience_s=5)
+    assert bench.states_since(killed_at) == [TRACKING, SLOWING, HOLDING]
+    assert_slowed_down_and_holds(bench, killed_at)
+
+    bench.control("second control")
+    bench.play(plan_id=2)
+    bench.until(lambda: bench.status.state == TRACKING, "the new session is obeyed")
+    assert bench.status.session not in (0, old_session)
+    bench.until(lambda: speed(bench.status) > 0.1, "the arm moves again")
+
+
+def test_control_gone_for_long_is_a_fault_that_only_a_reset_ends(moving):
+    bench = moving
+    kill(bench.processes.running.pop("intabs_control"))
+    bench.until(lambda: bench.status.state == FAULT, "fault after 2 s of holding", patience_s=10)
+    assert bench.status.fault == STALE_COMMAND
+
+    bench.control("second control")
+    bench.play(plan_id=2)
+    refused = sum(bench.status.refused)
+    bench.until(lambda: sum(bench.status.refused) > refused, "commands are refused and counted")
+    assert bench.status.state == FAULT
+
+    reset = messages.reset_t()
+    reset.session = bench.heard["LITE6_COMMAND"][-1].session
+    bench.bus.publish("RESET", reset)
+    bench.until(lambda: bench.status.state != FAULT, "the reset ends the fault")
+    bench.play(plan_id=3)
+    bench.until(lambda: bench.status.state == TRACKING, "the named session is obeyed")
+    assert bench.status.session == reset.session
+
+
+def test_perception_killed_in_mid_motion_then_a_new_one_takes_over(moving):
+    bench = moving
+    killed_at = len(bench.heard["LITE6_STATUS"])
+    kill(bench.processes.running.pop("intabs_perception"))
+    bench.until(lambda: bench.status.state == HOLDING, "the arm holds", patience_s=5)
+    assert bench.states_since(killed_at) == [TRACKING, SLOWING, HOLDING]
+    assert bench.heard["SKILL_STATUS"][-1].end_reason == STALE_POSES
+    assert_slowed_down_and_holds(bench, killed_at)
+    assert "perception" in bench.processes.last_line("intabs_control")
+
+    old_session = bench.status.session
+    kill(bench.processes.running.pop("intabs_control"))
+    poses = len(bench.heard["OBJECT_POSES"])
+    bench.perception("second perception")
+    bench.until(lambda: len(bench.heard["OBJECT_POSES"]) > poses, "perception speaks again")
+    bench.control("second control")
+    bench.play(plan_id=2)
+    bench.until(lambda: bench.status.state == TRACKING, "the new session is obeyed")
+    assert bench.status.session not in (0, old_session)
