@@ -1,5 +1,5 @@
-// Pipeline for Python: dataset preprocessing and in-process rollouts. A pose is an array (7,): x y z [m], then the
-// quaternion w x y z.
+// Pipeline for Python: dataset preprocessing and in-process rollouts. A pose is an array (7,): x y z [m],
+// then the quaternion w x y z.
 #include <pybind11/eigen.h>
 #include <pybind11/numpy.h>
 #include <pybind11/pybind11.h>
@@ -24,15 +24,17 @@ py::array_t<double> ToArray(const Pose& X) {
   return out;
 }
 
-// Grey (H, W) as it is, RGB (H, W, 3) converted; None: the camera gave nothing. Keeps no reference to Python's memory.
+// Grey (H, W) as it is, RGB (H, W, 3) converted; None: the camera gave nothing. Keeps no reference to
+// Python's memory.
 cv::Mat ToGray(const py::handle& h) {
   if (h.is_none()) return {};
-  if (!py::isinstance<Image>(h)) throw py::value_error("an image must be a C-contiguous numpy array of uint8");
+  if (!py::isinstance<Image>(h))
+    throw py::value_error("an image must be a C-contiguous numpy array of uint8");
   const auto image = py::reinterpret_borrow<Image>(h);
   const bool rgb = image.ndim() == 3 && image.shape(2) == 3;
   if (!rgb && image.ndim() != 2) throw py::value_error("an image must be (H, W) grey or (H, W, 3) RGB");
-  const cv::Mat view(static_cast<int>(image.shape(0)), static_cast<int>(image.shape(1)), rgb ? CV_8UC3 : CV_8UC1,
-                     const_cast<uint8_t*>(image.data()));
+  const cv::Mat view(static_cast<int>(image.shape(0)), static_cast<int>(image.shape(1)),
+                     rgb ? CV_8UC3 : CV_8UC1, const_cast<uint8_t*>(image.data()));
   if (!rgb) return view.clone();
   cv::Mat gray;
   RgbToGray(view, gray);
@@ -82,7 +84,8 @@ py::dict Process(Pipeline& pipeline, const py::list& images, int64_t frame_seq, 
     *age.mutable_data(i) = o.age;
   }
   py::dict tags;
-  for (size_t c = 0; c < gray.size(); ++c) tags[py::str(pipeline.config().cameras[c].name)] = Tags(detections[c]);
+  for (size_t c = 0; c < gray.size(); ++c)
+    tags[py::str(pipeline.config().cameras[c].name)] = Tags(detections[c]);
   py::dict out;
   out["frame_seq"] = poses.frame_seq;
   out["exposure_us"] = poses.exposure_utime;
@@ -99,19 +102,27 @@ py::dict Process(Pipeline& pipeline, const py::list& images, int64_t frame_seq, 
 }  // namespace
 
 void Bind_perception(py::module_& m) {
-  py::class_<Pipeline>(m, "Pipeline",
-                       "Camera frames in, object poses in W out: the code of intabs_perception. Not for use by several "
-                       "threads at once.\n"
-                       "RuntimeError, one line, when the YAML file (models/config/perception.yaml) does not hold.")
-      .def(py::init([](const std::string& path) { return Pipeline(LoadPerceptionConfig(path)); }), py::arg("config"))
+  py::class_<Pipeline>(
+      m, "Pipeline",
+      "Camera frames in, object poses in W out: the code of intabs_perception. Not for use by several "
+      "threads at once.\n"
+      "RuntimeError, one line, when the YAML file (models/config/perception.yaml) does not hold.")
+      .def(py::init([](const std::string& path) { return Pipeline(LoadPerceptionConfig(path)); }),
+           py::arg("config"))
       .def("process", &Process, py::arg("images"), py::arg("frame_seq"), py::arg("exposure_us"),
-           "One frame of all cameras. images: one a camera, in the configuration's order, (H, W) grey or (H, W, 3) RGB\n"
-           "uint8, or None. Returns a dict, by slot: id (4,) (-1: unused or never seen), pose (4, 7) p_WO [m] and q_WO\n"
-           "wxyz, covariance (4, 21) (core/types.h), cameras (4,) bits, valid (4,), age (4,) [s]; and tags: {camera:\n"
-           "[{id, corners (4, 2) px, X_CT: two hypotheses (7,), reprojection_px, ambiguity, decision_margin}]}.\n"
-           "A pose not seen is held, valid for 0.5 s. RuntimeError for images that do not fit the configuration.")
+           "One frame of all cameras. images: one a camera, in the configuration's order, (H, W) grey or (H, "
+           "W, 3) RGB\n"
+           "uint8, or None. Returns a dict, by slot: id (4,) (-1: unused or never seen), pose (4, 7) p_WO "
+           "[m] and q_WO\n"
+           "wxyz, covariance (4, 21) (core/types.h), cameras (4,) bits, valid (4,), age (4,) [s]; and tags: "
+           "{camera:\n"
+           "[{id, corners (4, 2) px, X_CT: two hypotheses (7,), reprojection_px, ambiguity, "
+           "decision_margin}]}.\n"
+           "A pose not seen is held, valid for 0.5 s. RuntimeError for images that do not fit the "
+           "configuration.")
       .def("reset", &Pipeline::Reset, "As new.")
-      .def("redo_extrinsics", &Pipeline::RedoExtrinsics, "Finds the places of the cameras anew; poses are kept.")
+      .def("redo_extrinsics", &Pipeline::RedoExtrinsics,
+           "Finds the places of the cameras anew; poses are kept.")
       .def_property_readonly(
           "cameras",
           [](const Pipeline& p) {

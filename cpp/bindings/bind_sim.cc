@@ -57,7 +57,7 @@ class Rollout {
     SkillController controller(policy_, 1);
     controller.player().ZeroActions(ablate == "policy");
     bool success = false;
-    std::vector<double> q;
+    std::vector<double> q, poses_trace, gripper;
     uint64_t hash = 0;
     uint32_t subgoals = 0;
     double seconds = 0;
@@ -80,6 +80,11 @@ class Rollout {
         (void)controller.Tick(session_.status(), poses, command);
         (void)session_.Advance(command);
         for (int i = 0; i < kNumJoints; ++i) q.push_back(session_.status().q[i]);
+        gripper.push_back(session_.status().gripper_closed ? 1 : 0);
+        for (const TrackedObject& o : session_.world().Objects()) {
+          poses_trace.insert(poses_trace.end(), {o.X_WO.p.x(), o.X_WO.p.y(), o.X_WO.p.z(), o.X_WO.q.w(), o.X_WO.q.x(),
+                                                 o.X_WO.q.y(), o.X_WO.q.z()});
+        }
         subgoals |= session_.world().Subgoals();
         if (!controller.player().playing()) --left;
       }
@@ -95,7 +100,10 @@ class Rollout {
     d["state_hash"] = hash;
     d["duration_s"] = seconds;
     d["end_reason"] = static_cast<int>(controller.player().status().end_reason);
-    d["q"] = py::array_t<double>({static_cast<py::ssize_t>(q.size() / kNumJoints), py::ssize_t{kNumJoints}}, q.data());
+    const auto n = static_cast<py::ssize_t>(gripper.size());
+    d["q"] = py::array_t<double>({n, py::ssize_t{kNumJoints}}, q.data());
+    d["gripper"] = py::array_t<double>(n, gripper.data());
+    d["object_pose"] = py::array_t<double>({n, py::ssize_t{kMaxObjects}, py::ssize_t{7}}, poses_trace.data());
     return d;
   }
 
@@ -143,7 +151,9 @@ void Bind_sim(py::module_& m) {
            py::arg("models_dir"), py::arg("task"), py::arg("weights_dir"), py::arg("perception_config") = "")
       .def("run", &Rollout::Run, py::arg("seed"), py::arg("spread_cm"), py::arg("z"), py::arg("ticks"),
            py::arg("settle_ticks") = 25, py::arg("ablate") = "",
-           "z (n, 16), ticks: n durations. ablate: '', 'objects' (poses frozen at their first value) or 'policy' (zeros).");
+           "z (n, 16), ticks: n durations. ablate: '', 'objects' (poses frozen at their first value) or 'policy' (zeros).\n"
+           "Returns success, reason, subgoals (bits), state_hash, duration_s, end_reason and, after each tick, q (T, 6),\n"
+           "gripper (T,) and the true object_pose (T, 4, 7).");
 }
 
 }  // namespace intabs

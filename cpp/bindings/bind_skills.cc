@@ -100,14 +100,14 @@ void Bind_skills(py::module_& m) {
   m.attr("STATE_DIM") = kStateDim;
   m.def("assemble_states", &AssembleStates, py::arg("arm"), py::arg("q"), py::arg("gripper_closed"),
         py::arg("object_pose"), py::arg("object_known"), py::arg("object_valid"),
-        "State features s = [s^r, s^e] of each tick, not normalised, (T, 47) float32.\n\n"
+        "State features s = [s^r, s^e] of each tick, not normalised, (T, 59) float32.\n\n"
         "q (T, 6) rad; gripper_closed (T,); object_pose (T, 4, 7) p_WO [m] and q_WO wxyz; object_known (T, 4): seen at\n"
         "least once so far; object_valid (T, 4). The code that runs in the control loop. ValueError on a value that is\n"
         "not finite or a wrong shape.");
   m.def("object_motions", &ObjectMotions, py::arg("arm"), py::arg("q"), py::arg("object_pose"), py::arg("object_known"),
         "Motion a^e of each object from tick to tick, (T - 1, 24) float32: per slot [m, rad] in the gripper's axes.");
   m.def("normalize", &Normalize, py::arg("states"), py::arg("mean"), py::arg("scale"), py::arg("limit"),
-        "(states - mean) / scale clamped to +-limit, (T, 47) float32: what the policy's input gets at run time.");
+        "(states - mean) / scale clamped to +-limit, (T, 59) float32: what the policy's input gets at run time.");
 }
 
 }  // namespace intabs

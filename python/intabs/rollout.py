@@ -58,7 +58,8 @@ def run_trial(job: tuple[Setting, int]) -> dict:
     if setting.ablate == "z":
         z = z[np.random.default_rng(seed).permutation(len(z))]
     result = _cache[key].run(seed, setting.spread, z, ticks, SETTLE_TICKS, setting.ablate)
-    result.pop("q")
+    for trace in ("q", "gripper", "object_pose"):
+        result.pop(trace)
     return {"trial": trial, "seed": seed, **result}
 
 

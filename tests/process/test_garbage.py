@@ -3,7 +3,6 @@
 import json
 import random
 
-
 from bench import TRACKING, Bench, need_programs
 from intabs import messages
 

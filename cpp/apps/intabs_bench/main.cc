@@ -13,7 +13,8 @@ struct Suite {
   const char* what;
 };
 constexpr Suite kSuites[] = {
-    {"lstm", &intabs::bench::Lstm, "one policy tick in each weight format and instruction set, a batch, the memory limit"},
+    {"lstm", &intabs::bench::Lstm,
+     "one policy tick in each weight format and instruction set, a batch, the memory limit"},
     {"encoder", &intabs::bench::Encoder, "a bidirectional network over 100 steps, one thread and two"},
 };
 
@@ -31,9 +32,12 @@ int main(int argc, char** argv) {
   }
   app.add_option("suite", name, "One of:" + known)->required()->check(CLI::IsMember(names));
   app.add_option("--json", json, "Write the figures to this file");
-  app.add_option("--rounds", options.rounds, "Rounds, each of which measures every row")->check(CLI::Range(1, 100));
-  app.add_option("--samples", options.samples, "Samples of a quick row in a round")->check(CLI::Range(20, 1000000));
-  app.add_option("--soak", options.soak, "lstm: also a run of so many steps for the tail, pinned")->check(CLI::Range(0L, 100000000L));
+  app.add_option("--rounds", options.rounds, "Rounds, each of which measures every row")
+      ->check(CLI::Range(1, 100));
+  app.add_option("--samples", options.samples, "Samples of a quick row in a round")
+      ->check(CLI::Range(20, 1000000));
+  app.add_option("--soak", options.soak, "lstm: also a run of so many steps for the tail, pinned")
+      ->check(CLI::Range(0L, 100000000L));
   CLI11_PARSE(app, argc, argv);
   try {
     for (const Suite& s : kSuites) {

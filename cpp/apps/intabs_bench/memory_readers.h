@@ -1,4 +1,5 @@
-// The physical limit of one step: read as many bytes as the weights hold, once, in every way that might be the fastest.
+// The physical limit of one step: read as many bytes as the weights hold, once, in every way that might be
+// the fastest.
 #pragma once
 
 #include <cstddef>

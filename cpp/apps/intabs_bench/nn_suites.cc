@@ -22,9 +22,12 @@ struct Format {
   const char* name;
   int bytes;  // a weight
 };
-constexpr Format kFormats[] = {{WeightFormat::kFp32, "fp32", 4}, {WeightFormat::k16, "16", 2}, {WeightFormat::k8, "8", 1}};
+constexpr Format kFormats[] = {
+    {WeightFormat::kFp32, "fp32", 4}, {WeightFormat::k16, "16", 2}, {WeightFormat::k8, "8", 1}};
 
-NetworkSpec Policy() { return {.input = 32, .layers = 8, .hidden = 128, .residual = true, .heads = {{"action", 7}}}; }
+NetworkSpec Policy() {
+  return {.input = 32, .layers = 8, .hidden = 128, .residual = true, .heads = {{"action", 7}}};
+}
 
 RowMatrixXf Inputs(int rows, int cols) {
   std::mt19937 rng(1);
@@ -36,8 +39,8 @@ void Must(Status s) {
   if (s != Status::kOk) throw std::runtime_error("a step failed");
 }
 
-// The tail: a long run on one CPU, at real-time priority where that is allowed, beside a loop that does nothing but
-// watch the clock for the same number of equally long ticks.
+// The tail: a long run on one CPU, at real-time priority where that is allowed, beside a loop that does
+// nothing but watch the clock for the same number of equally long ticks.
 void Soak(Report& report, Network& net, const RowMatrixXf& X, long steps) {
   cpu_set_t before, one;
   sched_getaffinity(0, sizeof before, &before);
@@ -69,7 +72,8 @@ void Soak(Report& report, Network& net, const RowMatrixXf& X, long steps) {
   sched_setaffinity(0, sizeof before, &before);
   report.ratios["soak_step_fp32: worst / median"] = busy.Percentile(1) / busy.Percentile(.5);
   report.ratios["soak_empty_loop: worst / median"] = empty.Percentile(1) / empty.Percentile(.5);
-  report.notes.push_back(std::string("soak: pinned, ") + (fifo ? "SCHED_FIFO 80" : "normal priority (SCHED_FIFO is not allowed)"));
+  report.notes.push_back(std::string("soak: pinned, ") +
+                         (fifo ? "SCHED_FIFO 80" : "normal priority (SCHED_FIFO is not allowed)"));
 }
 
 }  // namespace
@@ -92,7 +96,8 @@ Report Lstm(const Options& options) {
       continue;
     }
     for (const Format& f : kFormats) {
-      const std::string name = std::string("step_") + f.name + (isa == BestIsa() ? "" : std::string(" ") + Name(isa));
+      const std::string name =
+          std::string("step_") + f.name + (isa == BestIsa() ? "" : std::string(" ") + Name(isa));
       paths.push_back({name, Network(weights, "net", {.format = f.format, .isa = isa}),
                        isa == BestIsa() ? options.samples : options.samples / 5});
       if (isa == BestIsa()) batches.emplace_back(paths.back().net, 64);
@@ -110,7 +115,8 @@ Report Lstm(const Options& options) {
     for (const Format& f : kFormats) {
       for (const MemoryReader& r : readers) {
         const size_t floats = memory.size() * f.bytes / 4 / 256 * 256;
-        Measure(by_reader[f.name][r.name], options.samples / 2, [&] { sink = sink + r.read(memory.data(), floats); });
+        Measure(by_reader[f.name][r.name], options.samples / 2,
+                [&] { sink = sink + r.read(memory.data(), floats); });
       }
     }
     for (Path& p : paths) {
@@ -123,9 +129,9 @@ Report Lstm(const Options& options) {
   }
 
   for (const Format& f : kFormats) {
-    const auto best = std::min_element(by_reader[f.name].begin(), by_reader[f.name].end(), [](const auto& a, const auto& b) {
-      return a.second.BestMedian() < b.second.BestMedian();
-    });
+    const auto best = std::min_element(
+        by_reader[f.name].begin(), by_reader[f.name].end(),
+        [](const auto& a, const auto& b) { return a.second.BestMedian() < b.second.BestMedian(); });
     const std::string memory_row = std::string("memory_") + f.name, step_row = std::string("step_") + f.name;
     report.rows[memory_row] = best->second;
     report.ratios[step_row + " / " + memory_row] =
@@ -160,7 +166,8 @@ Report Encoder(const Options& options) {
       for (const int threads : {1, 2}) {
         const std::string name = std::string("sequence_100_bi") + (threads == 2 ? "_2t" : "") +
                                  (k > 0 ? std::string(" ") + kFormats[k].name + " bit" : "");
-        Measure(report.rows[name], std::max(options.samples / 20, 5), [&] { nets[k].Sequence(X, heads, threads); });
+        Measure(report.rows[name], std::max(options.samples / 20, 5),
+                [&] { nets[k].Sequence(X, heads, threads); });
       }
     }
   }

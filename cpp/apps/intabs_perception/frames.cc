@@ -1,4 +1,4 @@
-#include "frames.h"
+#include "intabs_perception/frames.h"
 
 #include <algorithm>
 #include <chrono>
@@ -102,7 +102,8 @@ void SolveFrames(const FramesOptions& options) {
     for (size_t f = 0; f < frames.size(); ++f) {
       std::map<int, std::vector<TagView>> views;
       for (size_t c = 0; c < cameras.size(); ++c) {
-        const std::string file = options.dir + "/" + frames[f].at("images").at(cameras[c].model.name).get<std::string>();
+        const std::string file =
+            options.dir + "/" + frames[f].at("images").at(cameras[c].model.name).get<std::string>();
         const cv::Mat gray = cv::imread(file, cv::IMREAD_GRAYSCALE);
         if (gray.empty()) throw std::runtime_error(file + ": no readable image");
         if (independent) cameras[c].detector.Reset();
@@ -110,7 +111,8 @@ void SolveFrames(const FramesOptions& options) {
         const auto& seen = cameras[c].detector.Detect(gray, {}, f % 12 == 5 * c % 12);
         detect_ms.push_back(Milliseconds(start));
         for (const SeenTag& t : seen) {
-          views[t.id].push_back({static_cast<int>(c), size, Pose{}, t.corners, SolveTag(cameras[c].model, size, t.corners)});
+          views[t.id].push_back(
+              {static_cast<int>(c), size, Pose{}, t.corners, SolveTag(cameras[c].model, size, t.corners)});
         }
         if (f % kFullFrameEvery == 0) {
           TagDetector whole({});

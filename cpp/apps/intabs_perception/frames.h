@@ -1,4 +1,5 @@
-// intabs_perception --frames: solves a folder of frames whose cameras are known, instead of a running plant's.
+// intabs_perception --frames: solves a folder of frames whose cameras are known, instead of a running
+// plant's.
 #pragma once
 
 #include <string>
@@ -6,10 +7,10 @@
 namespace intabs {
 
 struct FramesOptions {
-  std::string dir;     // with frames.json: tag_size_m, cameras {name: K, width, height, X_WC}, frames [{images}]
-  std::string result;  // where the poses go: [{"frame", "tags": {id: 4x4 X_WT}, "covariance": {id: 6x6}}]
-  std::string json;    // figures; empty: none
-  bool single = false;       // the first camera alone
+  std::string dir;  // with frames.json: tag_size_m, cameras {name: K, width, height, X_WC}, frames [{images}]
+  std::string result;   // where the poses go: [{"frame", "tags": {id: 4x4 X_WT}, "covariance": {id: 6x6}}]
+  std::string json;     // figures; empty: none
+  bool single = false;  // the first camera alone
   bool independent = false;  // frames have nothing to do with each other; frames.json may say so itself
 };
 

@@ -1,20 +1,25 @@
 // intabs_plant: MuJoCo behind the channels of the arm.
 #include <CLI/CLI.hpp>
+#include <algorithm>
 #include <iostream>
+#include <string>
 
-#include "common/yaml_config.h"
+#include "../common/yaml_config.h"
 #include "intabs/rt/stop_signal.h"
-#include "intabs_plant/options.h"
-#include "intabs_plant/plant.h"
+#include "options.h"
+#include "plant.h"
 
 namespace intabs {
 namespace {
 
 int Main(int argc, char** argv) {
   PlantOptions o;
-  CLI::App app{"The simulated arm with its table and cameras: LITE6_COMMAND in; LITE6_STATUS, PLANT_TRUTH and frames out."};
+  CLI::App app{
+      "The simulated arm with its table and cameras: LITE6_COMMAND in; LITE6_STATUS, PLANT_TRUTH and frames "
+      "out."};
   AddYamlConfig(app);
-  app.add_option("--task", o.task, "what stands on the table and what counts as success")->capture_default_str();
+  app.add_option("--task", o.task, "what stands on the table and what counts as success")
+      ->capture_default_str();
   app.add_option("--seed", o.seed, "where the objects stand")->capture_default_str();
   app.add_option("--spread", o.spread, "how far from their nominal places at most, cm")
       ->check(CLI::Range(0.0, 100.0))
@@ -43,7 +48,9 @@ int Main(int argc, char** argv) {
     Plant plant(o);
     plant.Run();
   } catch (const std::exception& e) {
-    std::cerr << "intabs_plant: " << e.what() << "\n";
+    std::string line = e.what();  // MuJoCo speaks in several
+    std::replace(line.begin(), line.end(), '\n', ' ');
+    std::cerr << "intabs_plant: " << line << "\n";
     return 1;
   }
   return 0;

@@ -20,7 +20,7 @@ struct PlantOptions {
   std::string video;  // empty: none
   std::string strip;  // empty: none
   bool viewer = false;
-  std::string json;   // empty: none
+  std::string json;  // empty: none
 };
 
 }  // namespace intabs

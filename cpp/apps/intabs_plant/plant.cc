@@ -1,5 +1,6 @@
-#include "intabs_plant/plant.h"
+#include "plant.h"
 
+#include <algorithm>
 #include <cstdio>
 #include <fstream>
 #include <nlohmann/json.hpp>
@@ -13,9 +14,9 @@ namespace intabs {
 namespace {
 
 constexpr int kTicksPerPolicyTick = static_cast<int>(kPolicyPeriodUs / kDriverPeriodUs);
-constexpr int64_t kListenUs = 300'000;     // for another plant, before saying anything
-constexpr int kResendMs = 20;              // lockstep
-constexpr int64_t kStrangerUs = 1'000'000;  // so long the session in command is waited for when a stranger answers
+constexpr int64_t kListenUs = 300'000;      // for another plant, before saying anything
+constexpr int64_t kResendUs = 20'000;       // lockstep
+constexpr int64_t kStrangerUs = 1'000'000;  // a stranger answered: so long for the session in command
 constexpr int64_t kSilenceUs = 10'000'000;
 
 int64_t RandomId() {
@@ -36,18 +37,22 @@ Plant::Plant(const PlantOptions& options)
       sim_(options.models, options.task),
       source_(RandomId()) {
   bus_.Subscribe(kLite6Status, [this](const ArmStatus& s) { OnStatus(s); });
-  bus_.Subscribe(kLite6Command, [this](const ArmCommand& c) { OnCommand(c); },
-                 [this] { sim_.controller().CountUndecodable(); });
+  bus_.Subscribe(
+      kLite6Command, [this](const ArmCommand& c) { OnCommand(c); },
+      [this] { sim_.controller().CountUndecodable(); });
   bus_.Subscribe(kPlantControl, [this](const PlantControl& c) { OnControl(c); });
   bus_.Subscribe(kEstop, [this](const Estop& e) {
-    std::fprintf(stderr, "intabs_plant: ESTOP: %s\n", e.reason.c_str());
+    if (sim_.controller().state() != ArmState::kStopped) {
+      std::fprintf(stderr, "intabs_plant: ESTOP: %s\n", e.reason.c_str());
+    }
     sim_.controller().Estop();
   });
   bus_.Subscribe(kReset, [this](const Reset& r) { sim_.controller().ResetFault(r.session); });
 
-  for (const int64_t begin = MonotonicUs(); MonotonicUs() - begin < kListenUs && !StopRequested();) Handle(50);
+  for (const int64_t begin = MonotonicUs(); MonotonicUs() - begin < kListenUs && !StopRequested();)
+    Handle(50);
   StartOver(options.seed, options.spread);
-  // Last, because it leaves things behind on other machines' eyes: shared memory, files, a window.
+  // Last: others see what this makes (shared memory, files, a window).
   view_ = View::Make(sim_.world(), options_);
 }
 
@@ -70,31 +75,37 @@ void Plant::RunLockstep() {
       if (i > 0) PublishStatus();
       Tick();
     }
-    PublishLoopStatusNowAndThen();
   }
 }
 
 bool Plant::WaitForAnswer() {
   answer_ = Answer::kNone;
   started_over_ = false;
-  const int64_t begin_us = MonotonicUs();
-  int64_t sent_us = 0;
   ++truth_seq_;
-  while (!StopRequested() && !started_over_) {
+  const int64_t begin_us = MonotonicUs();
+  int64_t sent_us = begin_us;
+  PublishTruth();
+  PublishStatus();
+  if (view_) view_->Film();
+  while (!StopRequested()) {
+    const int64_t until_resend_us = kResendUs - (MonotonicUs() - sent_us);
+    Handle(static_cast<int>(std::max<int64_t>(until_resend_us + 999, 0) / 1000));
+    PublishLoopStatusNowAndThen();
+    if (started_over_) return false;
     const int64_t now_us = MonotonicUs();
     if (answer_ == Answer::kGiven) return true;
     if (answer_ == Answer::kStranger && now_us - begin_us > kStrangerUs) return true;
     if (now_us - begin_us > kSilenceUs) {
-      throw std::runtime_error("no LITE6_COMMAND answered for 10 s, at " + std::to_string(sim_.world().time_us() / 1000) +
+      throw std::runtime_error("no LITE6_COMMAND answered for 10 s, at " +
+                               std::to_string(sim_.world().time_us() / 1000) +
                                " ms of simulation: start intabs_control on " + options_.lcm +
                                " and send it a plan, or see what it said");
     }
-    if (now_us - sent_us >= kResendMs * 1000) {
+    if (now_us - sent_us >= kResendUs) {
       PublishTruth();
       PublishStatus();
       sent_us = now_us;
     }
-    Handle(kResendMs);
   }
   return false;
 }
@@ -118,8 +129,8 @@ void Plant::RunWall() {
   }
 }
 
-// In lockstep only the answer to the status that the plant waits with may move anything, or the run would depend on when
-// messages happen to arrive.
+// In lockstep only the answer to the status that the plant waits with may move anything, or the run would
+// depend on when messages happen to arrive.
 void Plant::OnCommand(const ArmCommand& c) {
   ArmController& controller = sim_.controller();
   const int64_t now_us = NowUs();
@@ -137,6 +148,7 @@ void Plant::OnCommand(const ArmCommand& c) {
   }
   const bool in_command = controller.Busy(now_us);
   const Refusal refusal = controller.Accept(c, now_us);
+  if (c.session <= 0) return;
   if (refusal == Refusal::kForeignSession && in_command) {
     answer_ = Answer::kStranger;
     return;

@@ -8,8 +8,8 @@
 #include "intabs/bus/lcm_bus.h"
 #include "intabs/rt/tick_stats.h"
 #include "intabs/sim/arm_sim.h"
-#include "intabs_plant/options.h"
-#include "intabs_plant/view.h"
+#include "options.h"
+#include "view.h"
 
 namespace intabs {
 
@@ -64,8 +64,8 @@ class Plant {
   int64_t loop_seq_ = 0, loop_status_us_ = 0;
   int64_t ticks_ = 0, overruns_ = 0, started_us_ = 0;
   float tick_us_ = 0;
-  TickStats wakeup_stats_, tick_stats_;      // of the running second
-  TickStats wakeup_total_, tick_total_;      // of the whole run
+  TickStats wakeup_stats_, tick_stats_;  // of the running second
+  TickStats wakeup_total_, tick_total_;  // of the whole run
 };
 
 }  // namespace intabs

@@ -9,22 +9,26 @@
 
 #include "intabs/plant/world.h"
 #include "intabs/rt/latest.h"
-#include "intabs_plant/options.h"
+#include "options.h"
 
 namespace intabs {
 
 class Painter;
 
-// In lockstep Look() draws before it returns. By the wall clock it leaves a snapshot to a thread of its own and returns at
-// once; what that thread does not get to is skipped.
+// In lockstep the caller's thread draws. By the wall clock Look() leaves a snapshot to a thread of its own
+// and returns at once; what that thread does not get to is skipped.
 class View {
  public:
   // Null when the options ask for no pictures. Throws when they cannot be made.
   static std::unique_ptr<View> Make(const World& world, const PlantOptions& options);
   ~View();
 
-  // Throws what went wrong, in the thread too.
+  // Camera frames of the world as it is. Throws what went wrong, in the thread too.
   void Look(const World& world, int64_t frame_seq, int64_t exposure_us);
+
+  // Lockstep: video, strip and window of what Look() saw; at leisure, while perception and control are at
+  // work. By the wall clock the thread does it.
+  void Film();
 
   // The newest frame that can be read from the ring.
   int64_t newest_frame_seq() const { return newest_frame_seq_; }
@@ -41,10 +45,9 @@ class View {
 
   View(const World& world, const PlantOptions& options);
   void PaintInThread(const World& world, const PlantOptions& options);
-  void JoinThread();
 
-  std::unique_ptr<Painter> painter_;  // made and used by one thread: a picture's context belongs to it
-  Shot shot_;
+  std::unique_ptr<Painter> painter_;  // lockstep only
+  Snapshot snapshot_;
   std::atomic<int64_t> newest_frame_seq_{0};
 
   std::thread thread_;

@@ -10,7 +10,8 @@ Bus::Bus(std::string prefix) : prefix_(std::move(prefix)) {
   };
   for (const char c : prefix_) {
     if (!is_plain(c)) {
-      throw std::runtime_error("channel prefix \"" + prefix_ + "\": only letters, digits and underscores, like MASTER_");
+      throw std::runtime_error("channel prefix \"" + prefix_ +
+                               "\": only letters, digits and underscores, like MASTER_");
     }
   }
 }

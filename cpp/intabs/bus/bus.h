@@ -1,4 +1,5 @@
-// Typed publish and subscribe over LCM (lcm_bus.h) or within one process (memory_bus.h). Both carry the same bytes.
+// Typed publish and subscribe over LCM (lcm_bus.h) or within one process (memory_bus.h). Both carry the same
+// bytes.
 //
 //   LcmBus bus("udpm://239.255.76.67:7667?ttl=0", /*prefix=*/"");
 //   Newest<ArmStatus> status;
@@ -41,8 +42,8 @@ inline Channel<TagDetections> TagDetectionsChannel(const std::string& camera) {
   return {"TAG_DETECTIONS_" + camera};
 }
 
-// One thread at a time. Not real-time safe as a whole: a publish is one system call, without allocation for the messages
-// of the arm.
+// One thread at a time. Not real-time safe as a whole: a publish is one system call, without allocation for
+// the messages of the arm.
 class Bus {
  public:
   // `prefix` comes before every channel's name (two arms on one network: "MASTER_"). Throws unless it is of
@@ -59,14 +60,14 @@ class Bus {
     return size > 0 && PublishBytes(channel.name, buffer_, size);
   }
 
-  // `handler` runs inside Handle(), for every message, in the order of arrival. A datagram that is not a whole message
-  // of this type changes nothing: it is counted, and `on_undecodable` runs if there is one.
+  // `handler` runs inside Handle(), for every message, in the order of arrival. A datagram that is not a
+  // whole message of this type changes nothing: it is counted, and `on_undecodable` runs if there is one.
   template <class M>
   void Subscribe(const Channel<M>& channel, std::type_identity_t<std::function<void(const M&)>> handler,
                  std::function<void()> on_undecodable = nullptr) {
     SubscribeBytes(channel.name,
-                   [this, handler = std::move(handler), on_undecodable = std::move(on_undecodable), message = M()](
-                       const uint8_t* data, size_t size) mutable {
+                   [this, handler = std::move(handler), on_undecodable = std::move(on_undecodable),
+                    message = M()](const uint8_t* data, size_t size) mutable {
                      if (Decode(data, size, message)) {
                        handler(message);
                      } else {
@@ -76,8 +77,8 @@ class Bus {
                    });
   }
 
-  // Waits for a message, at most timeout_ms, then hands out all that have come. Returns how many, 0 also after a signal,
-  // -1 when the bus is broken.
+  // Waits for a message, at most timeout_ms, then hands out all that have come. Returns how many, 0 also
+  // after a signal, -1 when the bus is broken.
   virtual int Handle(int timeout_ms) = 0;
 
   // Undecodable datagrams so far, all subscriptions together.
@@ -96,8 +97,8 @@ class Bus {
   uint8_t buffer_[kMaxMessageBytes];
 };
 
-// Of all messages of one Handle() keeps the one with the highest seq: LCM hands out a backlog oldest first. What was taken
-// before does not count: a repeated seq, or that of a restarted sender, is offered again.
+// Of all messages of one Handle() keeps the one with the highest seq: LCM hands out a backlog oldest first.
+// What was taken before does not count: a repeated seq, or that of a restarted sender, is offered again.
 template <class M>
 class Newest {
  public:

@@ -22,21 +22,25 @@
 namespace intabs {
 namespace {
 
-// Offsets in a datagram: 8 bytes of fingerprint come first. lcm-gen's decoders trust the length of a string and the count
-// of an array (a negative length makes them read gigabytes), so both are checked before a decoder sees them.
-constexpr size_t kStringAt = 24;         // in every message with a string: after utime and seq
-constexpr size_t kPlanCountAt = 36;      // n of skill_plan_t
+// Offsets in a datagram: 8 bytes of fingerprint come first. lcm-gen's decoders trust the length of a string
+// and the count of an array (a negative length makes them read gigabytes), so both are checked before a
+// decoder sees them.
+constexpr size_t kStringAt = 24;           // in every message with a string: after utime and seq
+constexpr size_t kPlanCountAt = 36;        // n of skill_plan_t
 constexpr size_t kDetectionsCountAt = 40;  // n of tag_detections_t
 
 bool StringIsWhole(const uint8_t* data, size_t size, int max_length) {
   if (size < kStringAt + 5) return false;
   const uint8_t* p = data + kStringAt;
-  const uint32_t length = uint32_t{p[0]} << 24 | uint32_t{p[1]} << 16 | uint32_t{p[2]} << 8 | p[3];  // with its NUL
+  const uint32_t length =
+      uint32_t{p[0]} << 24 | uint32_t{p[1]} << 16 | uint32_t{p[2]} << 8 | p[3];  // with its NUL
   return length >= 1 && length <= static_cast<uint32_t>(max_length) + 1 && size >= kStringAt + 4 + length &&
          p[4 + length - 1] == 0;
 }
 
-bool CountIsWithin(const uint8_t* data, size_t size, size_t at, int max) { return size > at && data[at] <= max; }
+bool CountIsWithin(const uint8_t* data, size_t size, size_t at, int max) {
+  return size > at && data[at] <= max;
+}
 
 template <class... T>
 bool Finite(const T&... values) {
@@ -47,8 +51,12 @@ bool AllFinite(const A& values) {
   return std::all_of(std::begin(values), std::end(values), [](auto v) { return std::isfinite(v); });
 }
 
-void Copy(const JointVector& from, double (&to)[kNumJoints]) { Eigen::Map<JointVector>(to, kNumJoints) = from; }
-JointVector Joints(const double (&from)[kNumJoints]) { return Eigen::Map<const JointVector>(from, kNumJoints); }
+void Copy(const JointVector& from, double (&to)[kNumJoints]) {
+  Eigen::Map<JointVector>(to, kNumJoints) = from;
+}
+JointVector Joints(const double (&from)[kNumJoints]) {
+  return Eigen::Map<const JointVector>(from, kNumJoints);
+}
 
 template <class T>
 void CopyPose(const Pose& X, T (&p)[3], T (&q)[4]) {
@@ -162,7 +170,8 @@ bool FromLcm(const intabs_lcm::object_poses_t& l, ObjectPoses& m) {
     o.cameras = l.cameras[i];
     o.valid = l.valid[i] != 0;
     o.age = l.age[i];
-    if (!o.X_WO.IsFinite() || !IsRotation(o.X_WO.q) || !AllFinite(o.covariance) || !Finite(o.age)) return false;
+    if (!o.X_WO.IsFinite() || !IsRotation(o.X_WO.q) || !AllFinite(o.covariance) || !Finite(o.age))
+      return false;
   }
   return true;
 }
@@ -179,7 +188,8 @@ void ToLcm(const PlantTruth& m, intabs_lcm::plant_truth_t& l) {
   l.success = m.success;
   l.state_hash = static_cast<int64_t>(m.state_hash);
 }
-// What the plant says of an object is exact and new, which the message does not repeat: valid, age 0, no covariance.
+// What the plant says of an object is exact and new, which the message does not repeat: valid, age 0, no
+// covariance.
 bool FromLcm(const intabs_lcm::plant_truth_t& l, PlantTruth& m) {
   m.utime = l.utime;
   m.seq = l.seq;
@@ -397,7 +407,8 @@ bool FromLcm(const intabs_lcm::reset_t& l, Reset& m) {
   return true;
 }
 
-// Which generated message carries a struct, and what must hold of the bytes before lcm-gen's decoder may see them.
+// Which generated message carries a struct, and what must hold of the bytes before lcm-gen's decoder may see
+// them.
 template <class M>
 struct Wire;
 template <class L>
@@ -415,18 +426,30 @@ struct CountWire {
   using Message = L;
   static bool IsSafe(const uint8_t* data, size_t size) { return CountIsWithin(data, size, at, max); }
 };
-template <> struct Wire<ArmCommand> : PlainWire<intabs_lcm::lite6_command_t> {};
-template <> struct Wire<ArmStatus> : PlainWire<intabs_lcm::lite6_status_t> {};
-template <> struct Wire<ObjectPoses> : PlainWire<intabs_lcm::object_poses_t> {};
-template <> struct Wire<PlantTruth> : PlainWire<intabs_lcm::plant_truth_t> {};
-template <> struct Wire<SkillStatus> : PlainWire<intabs_lcm::skill_status_t> {};
-template <> struct Wire<PerceptionStatus> : PlainWire<intabs_lcm::perception_status_t> {};
-template <> struct Wire<Reset> : PlainWire<intabs_lcm::reset_t> {};
-template <> struct Wire<TagDetections> : CountWire<intabs_lcm::tag_detections_t, kDetectionsCountAt, kMaxTags> {};
-template <> struct Wire<SkillPlan> : CountWire<intabs_lcm::skill_plan_t, kPlanCountAt, kMaxSkillsPerPart> {};
-template <> struct Wire<LoopStatus> : StringWire<intabs_lcm::loop_status_t, kMaxLoopName> {};
-template <> struct Wire<PlantControl> : StringWire<intabs_lcm::plant_control_t, kMaxTaskName> {};
-template <> struct Wire<Estop> : StringWire<intabs_lcm::estop_t, kMaxReason> {};
+template <>
+struct Wire<ArmCommand> : PlainWire<intabs_lcm::lite6_command_t> {};
+template <>
+struct Wire<ArmStatus> : PlainWire<intabs_lcm::lite6_status_t> {};
+template <>
+struct Wire<ObjectPoses> : PlainWire<intabs_lcm::object_poses_t> {};
+template <>
+struct Wire<PlantTruth> : PlainWire<intabs_lcm::plant_truth_t> {};
+template <>
+struct Wire<SkillStatus> : PlainWire<intabs_lcm::skill_status_t> {};
+template <>
+struct Wire<PerceptionStatus> : PlainWire<intabs_lcm::perception_status_t> {};
+template <>
+struct Wire<Reset> : PlainWire<intabs_lcm::reset_t> {};
+template <>
+struct Wire<TagDetections> : CountWire<intabs_lcm::tag_detections_t, kDetectionsCountAt, kMaxTags> {};
+template <>
+struct Wire<SkillPlan> : CountWire<intabs_lcm::skill_plan_t, kPlanCountAt, kMaxSkillsPerPart> {};
+template <>
+struct Wire<LoopStatus> : StringWire<intabs_lcm::loop_status_t, kMaxLoopName> {};
+template <>
+struct Wire<PlantControl> : StringWire<intabs_lcm::plant_control_t, kMaxTaskName> {};
+template <>
+struct Wire<Estop> : StringWire<intabs_lcm::estop_t, kMaxReason> {};
 
 }  // namespace
 

@@ -20,7 +20,8 @@ constexpr char kCure[] = "ip link set lo up; ip link set lo multicast on; ip rou
 void RequireRoute(const std::string& url) {
   constexpr char kScheme[] = "udpm://";
   if (url.rfind(kScheme, 0) != 0) {
-    throw std::runtime_error("LCM URL \"" + url + "\" is not of UDP multicast; give one like " + kDefaultLcmUrl);
+    throw std::runtime_error("LCM URL \"" + url + "\" is not of UDP multicast; give one like " +
+                             kDefaultLcmUrl);
   }
   const size_t begin = std::strlen(kScheme);
   std::string host = url.substr(begin, url.find_first_of(":?", begin) - begin);
@@ -28,7 +29,8 @@ void RequireRoute(const std::string& url) {
   sockaddr_in address{};
   address.sin_family = AF_INET;
   address.sin_port = htons(7667);
-  if (inet_pton(AF_INET, host.c_str(), &address.sin_addr) != 1 || !IN_MULTICAST(ntohl(address.sin_addr.s_addr))) {
+  if (inet_pton(AF_INET, host.c_str(), &address.sin_addr) != 1 ||
+      !IN_MULTICAST(ntohl(address.sin_addr.s_addr))) {
     throw std::runtime_error("LCM URL \"" + url + "\": \"" + host +
                              "\" is no multicast address; give one like " + kDefaultLcmUrl);
   }
@@ -44,7 +46,8 @@ void RequireRoute(const std::string& url) {
 }
 
 void Dispatch(const lcm_recv_buf_t* received, const char*, void* handler) {
-  (*static_cast<Bus::BytesHandler*>(handler))(static_cast<const uint8_t*>(received->data), received->data_size);
+  (*static_cast<Bus::BytesHandler*>(handler))(static_cast<const uint8_t*>(received->data),
+                                              received->data_size);
 }
 
 }  // namespace

@@ -10,7 +10,8 @@
 
 namespace intabs {
 
-// Publisher and subscribers share one object. Handle() never waits; what a handler publishes comes with the next Handle().
+// Publisher and subscribers share one object. Handle() never waits; what a handler publishes comes with the
+// next Handle().
 class MemoryBus final : public Bus {
  public:
   explicit MemoryBus(std::string prefix = "") : Bus(std::move(prefix)) {}

@@ -1,4 +1,5 @@
-// Messages that no room but the apps needs: plans, states of loops, orders to the plant. The shared ones are in core/types.h.
+// Messages that no room but the apps needs: plans, states of loops, orders to the plant. The shared ones are
+// in core/types.h.
 #pragma once
 
 #include <array>

@@ -44,9 +44,9 @@ struct Layout {
   size_t total() const { return sizeof(Header) + count() * (sizeof(Slot) + padded()); }
 };
 
-// Seqlocks need their data to be atomic too (H.-J. Boehm, "Can seqlocks get along with programming language memory
-// models?", 2012). Release stores and acquire loads of the words take the place of fences: who sees one word of a new
-// picture also sees that the slot's version has changed.
+// Seqlocks need their data to be atomic too (H.-J. Boehm, "Can seqlocks get along with programming language
+// memory models?", 2012). Release stores and acquire loads of the words take the place of fences: who sees
+// one word of a new picture also sees that the slot's version has changed.
 void StoreWords(uint64_t* shared, const uint8_t* from, size_t bytes) noexcept {
   for (size_t i = 0; i < bytes; i += 8) {
     uint64_t word = 0;
@@ -57,7 +57,8 @@ void StoreWords(uint64_t* shared, const uint8_t* from, size_t bytes) noexcept {
 
 void LoadWords(const uint64_t* shared, uint8_t* to, size_t bytes) noexcept {
   for (size_t i = 0; i < bytes; i += 8) {
-    const uint64_t word = std::atomic_ref(const_cast<uint64_t&>(shared[i / 8])).load(std::memory_order_acquire);
+    const uint64_t word =
+        std::atomic_ref(const_cast<uint64_t&>(shared[i / 8])).load(std::memory_order_acquire);
     std::memcpy(to + i, &word, std::min<size_t>(8, bytes - i));
   }
 }
@@ -86,12 +87,16 @@ struct Mapping {
   Mapping& operator=(const Mapping&) = delete;
 
   Header& header() const { return *static_cast<Header*>(memory); }
-  Slot& slot(size_t i) const { return reinterpret_cast<Slot*>(static_cast<char*>(memory) + sizeof(Header))[i]; }
+  Slot& slot(size_t i) const {
+    return reinterpret_cast<Slot*>(static_cast<char*>(memory) + sizeof(Header))[i];
+  }
   uint64_t* pixels(size_t i) const {
     char* first = static_cast<char*>(memory) + sizeof(Header) + layout.count() * sizeof(Slot);
     return reinterpret_cast<uint64_t*>(first + i * layout.padded());
   }
-  size_t Index(int camera, int64_t frame_seq) const { return size_t(camera) * layout.slots + frame_seq % layout.slots; }
+  size_t Index(int camera, int64_t frame_seq) const {
+    return size_t(camera) * layout.slots + frame_seq % layout.slots;
+  }
 
   void* memory;
   Layout layout;
@@ -110,7 +115,8 @@ void RemoveStale(const std::string& name) {
 }  // namespace
 
 struct FrameRingWriter::Map {
-  Map(const std::string& n, int fd, void* base, const Layout& layout) : name(n), lock(fd), ring(base, layout) {}
+  Map(const std::string& n, int fd, void* base, const Layout& layout)
+      : name(n), lock(fd), ring(base, layout) {}
   ~Map() { shm_unlink(name.c_str()); }
 
   const std::string name;
@@ -122,14 +128,16 @@ FrameRingWriter::FrameRingWriter(const std::string& name, const std::vector<std:
                                  int height, int slots) {
   const Layout layout{static_cast<int>(cameras.size()), width, height, slots};
   if (cameras.empty() || cameras.size() > kMaxCameras) {
-    throw Error(name, std::to_string(cameras.size()) + " cameras; it holds 1 to " + std::to_string(kMaxCameras));
+    throw Error(name,
+                std::to_string(cameras.size()) + " cameras; it holds 1 to " + std::to_string(kMaxCameras));
   }
   if (width < 1 || height < 1 || int64_t{width} * height > kMaxPixels || slots < 1 || slots > kMaxSlots) {
     throw Error(name, "cannot hold " + std::to_string(slots) + " slots of " + std::to_string(width) + "x" +
                           std::to_string(height));
   }
   for (const std::string& c : cameras) {
-    if (c.empty() || c.size() >= kNameSize) throw Error(name, "camera name \"" + c + "\" must have 1 to 31 bytes");
+    if (c.empty() || c.size() >= kNameSize)
+      throw Error(name, "camera name \"" + c + "\" must have 1 to 31 bytes");
   }
 
   RemoveStale(name);
@@ -137,15 +145,17 @@ FrameRingWriter::FrameRingWriter(const std::string& name, const std::vector<std:
   if (fd.fd < 0) throw Error(name, std::string("cannot be made: ") + std::strerror(errno));
   void* base = MAP_FAILED;
   // posix_fallocate, not ftruncate: where /dev/shm is too small we hear of it now, not by a SIGBUS later.
-  int fault = flock(fd.fd, LOCK_EX | LOCK_NB) == 0 ? posix_fallocate(fd.fd, 0, static_cast<off_t>(layout.total())) : errno;
+  int fault = flock(fd.fd, LOCK_EX | LOCK_NB) == 0
+                  ? posix_fallocate(fd.fd, 0, static_cast<off_t>(layout.total()))
+                  : errno;
   if (fault == 0) {
     base = mmap(nullptr, layout.total(), PROT_READ | PROT_WRITE, MAP_SHARED, fd.fd, 0);
     if (base == MAP_FAILED) fault = errno;
   }
   if (fault != 0) {
     shm_unlink(name.c_str());
-    throw Error(name, std::to_string(layout.total() >> 20) + " MiB of shared memory are not to be had (/dev/shm): " +
-                          std::strerror(fault));
+    throw Error(name, std::to_string(layout.total() >> 20) +
+                          " MiB of shared memory are not to be had (/dev/shm): " + std::strerror(fault));
   }
   map_ = std::make_unique<Map>(name, fd.fd, base, layout);
   fd.fd = -1;  // handed over
@@ -181,8 +191,9 @@ struct FrameRingReader::Map : Mapping {
 FrameRingReader::FrameRingReader(const std::string& name) {
   const Descriptor fd(shm_open(name.c_str(), O_RDONLY, 0));
   if (fd.fd < 0) {
-    throw Error(name, errno == ENOENT ? "there is none: start the plant or a camera first, with the same ring name"
-                                      : std::string("cannot be opened: ") + std::strerror(errno));
+    throw Error(name, errno == ENOENT
+                          ? "there is none: start the plant or a camera first, with the same ring name"
+                          : std::string("cannot be opened: ") + std::strerror(errno));
   }
   struct stat file;
   if (fstat(fd.fd, &file) != 0) throw Error(name, std::strerror(errno));
@@ -195,15 +206,17 @@ FrameRingReader::FrameRingReader(const std::string& name) {
   const Header& h = *static_cast<const Header*>(base);
   const bool ready = h.magic.load(std::memory_order_acquire) == kMagic;
   const Layout layout{h.num_cameras, h.width, h.height, h.slots};
-  const bool sane = ready && layout.num_cameras >= 1 && layout.num_cameras <= kMaxCameras && layout.width >= 1 &&
-                    layout.height >= 1 && int64_t{layout.width} * layout.height <= kMaxPixels && layout.slots >= 1 &&
+  const bool sane = ready && layout.num_cameras >= 1 && layout.num_cameras <= kMaxCameras &&
+                    layout.width >= 1 && layout.height >= 1 &&
+                    int64_t{layout.width} * layout.height <= kMaxPixels && layout.slots >= 1 &&
                     layout.slots <= kMaxSlots && layout.total() == size;
   if (!sane) {
     munmap(base, size);
     throw Error(name, unreadable);
   }
   map_ = std::make_unique<Map>(base, layout);
-  for (int i = 0; i < layout.num_cameras; ++i) cameras_.emplace_back(h.names[i], strnlen(h.names[i], kNameSize));
+  for (int i = 0; i < layout.num_cameras; ++i)
+    cameras_.emplace_back(h.names[i], strnlen(h.names[i], kNameSize));
 }
 
 FrameRingReader::~FrameRingReader() = default;

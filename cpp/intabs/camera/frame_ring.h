@@ -1,5 +1,5 @@
-// Colour frames from one writing process to any number of reading ones, through POSIX shared memory: a ring of slots a
-// camera, each under a seqlock. The writer never waits; a reader that comes too late is told so.
+// Colour frames from one writing process to any number of reading ones, through POSIX shared memory: a ring
+// of slots a camera, each under a seqlock. The writer never waits; a reader that comes too late is told so.
 #pragma once
 
 #include <cstdint>
@@ -23,15 +23,16 @@ class FrameRingWriter {
  public:
   static constexpr int kDefaultSlots = 8;
 
-  // name: as in shm_open, "/intabs_frames". What a killed writer left under it is replaced; the ring of one that still
-  // runs is not: throws. At most kMaxCameras cameras with names of at most 31 bytes.
+  // name: as in shm_open, "/intabs_frames". What a killed writer left under it is replaced; the ring of one
+  // that still runs is not: throws. At most kMaxCameras cameras with names of at most 31 bytes.
   FrameRingWriter(const std::string& name, const std::vector<std::string>& cameras, int width, int height,
                   int slots = kDefaultSlots);
   ~FrameRingWriter();  // takes the name away; readers keep what they have mapped
   FrameRingWriter(const FrameRingWriter&) = delete;
   FrameRingWriter& operator=(const FrameRingWriter&) = delete;
 
-  // rgb: H * W * 3. frame_seq > 0 and rising; every camera gets every frame. No allocation, no lock, no system call.
+  // rgb: H * W * 3. frame_seq > 0 and rising; every camera gets every frame. No allocation, no lock, no
+  // system call.
   void Write(int camera, int64_t frame_seq, int64_t exposure_us, const uint8_t* rgb) noexcept;
 
  private:
@@ -43,8 +44,8 @@ class FrameRingWriter {
 class FrameRingReader {
  public:
   // Throws std::runtime_error in one line when there is no such ring.
-  // A ring outlives its writer in a reader's hands and then just gets no new frames: to follow a new writer of the same
-  // name, make a new reader.
+  // A ring outlives its writer in a reader's hands and then just gets no new frames: to follow a new writer
+  // of the same name, make a new reader.
   explicit FrameRingReader(const std::string& name);
   ~FrameRingReader();
   FrameRingReader(const FrameRingReader&) = delete;
@@ -58,8 +59,8 @@ class FrameRingReader {
   // The newest frame that all cameras have; 0: none yet.
   int64_t newest_seq() const noexcept;
 
-  // Copies that frame out; reuses out.rgb's memory. False when it is not written yet, overwritten already, or was
-  // overwritten during the copy: `out` then holds nothing of use.
+  // Copies that frame out; reuses out.rgb's memory. False when it is not written yet, overwritten already, or
+  // was overwritten during the copy: `out` then holds nothing of use.
   bool Read(int64_t frame_seq, int camera, Frame& out) const;
 
  private:

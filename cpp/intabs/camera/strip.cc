@@ -10,10 +10,11 @@ namespace {
 constexpr int kKeptPerPicture = 8;
 }  // namespace
 
-PictureStrip::PictureStrip(int pictures, int picture_width) : pictures_(pictures), picture_width_(picture_width) {
+PictureStrip::PictureStrip(int pictures, int picture_width)
+    : pictures_(pictures), picture_width_(picture_width) {
   if (pictures < 2 || picture_width < 1) {
-    throw std::runtime_error("a strip of " + std::to_string(pictures) + " pictures of " + std::to_string(picture_width) +
-                             " px: it needs at least 2 of 1");
+    throw std::runtime_error("a strip of " + std::to_string(pictures) + " pictures of " +
+                             std::to_string(picture_width) + " px: it needs at least 2 of 1");
   }
 }
 
@@ -48,7 +49,8 @@ void PictureStrip::Save(const std::string& png) const {
     written = cv::imwrite(png, strip);
   } catch (const cv::Exception&) {  // an unknown ending
   }
-  if (!written) throw std::runtime_error(png + ": cannot be written: its folder must exist and its name end in .png");
+  if (!written)
+    throw std::runtime_error(png + ": cannot be written: its folder must exist and its name end in .png");
 }
 
 }  // namespace intabs

@@ -18,7 +18,8 @@ class VideoWriter {
 
   void Write(const uint8_t* rgb);  // H * W * 3, row 0 on top
 
-  // Finishes the file and opens it again: throws when it does not hold all frames (a full disk shows only here).
+  // Finishes the file and opens it again: throws when it does not hold all frames (a full disk shows only
+  // here).
   void Close();
 
  private:

@@ -2,7 +2,8 @@
 
 namespace intabs {
 
-ArmController::ArmController(const ArmLimits& limits, const ArmModel& model) noexcept : filter_(limits, model) {}
+ArmController::ArmController(const ArmLimits& limits, const ArmModel& model) noexcept
+    : filter_(limits, model) {}
 
 void ArmController::Reset(const JointVector& q_measured, int64_t now_us) noexcept {
   *this = ArmController(filter_.limits(), filter_.model());
@@ -32,8 +33,9 @@ Refusal ArmController::Check(const ArmCommand& c, int64_t now_us) const noexcept
   if (c.mode != ArmMode::kHold && c.mode != ArmMode::kServo) return Refusal::kUnknownMode;
   if (!c.q_target.allFinite() || !c.dq_max.allFinite()) return Refusal::kNotFinite;
   const ArmLimits& limits = filter_.limits();
-  if ((c.q_target.array() < limits.q_min.array()).any() || (c.q_target.array() > limits.q_max.array()).any() ||
-      (c.dq_max.array() <= 0).any() || c.lifetime_us <= 0 || c.lifetime_us > kMaxLifetimeUs) {
+  if ((c.q_target.array() < limits.q_min.array()).any() ||
+      (c.q_target.array() > limits.q_max.array()).any() || (c.dq_max.array() <= 0).any() ||
+      c.lifetime_us <= 0 || c.lifetime_us > kMaxLifetimeUs) {
     return Refusal::kOutOfRange;
   }
   if (same_session && has_seq_ && c.seq <= last_seq_) return Refusal::kOldSequence;

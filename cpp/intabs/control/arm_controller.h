@@ -1,9 +1,9 @@
-// What stands between a policy's commands and the arm: sessions, command filter, watchdog and safety states. The same
-// object runs in the plant, in the driver of the real arm and in in-process rollouts.
+// What stands between a policy's commands and the arm: sessions, command filter, watchdog and safety states.
+// The same object runs in the plant, in the driver of the real arm and in in-process rollouts.
 //
 //   Idle --command--> Tracking --stale or kHold--> Slowing --at rest--> Holding --stale for 2 s--> Fault
-//                        ^------------command of the session-----|--------|        ESTOP in any state --> Stopped
-//   RESET leads from Fault and Stopped to Holding (by way of Slowing while it moves).
+//                        ^----- command of the session ---|----------------|
+//   ESTOP leads from any state to Stopped; RESET from Fault and Stopped to Holding (by way of Slowing).
 #pragma once
 
 #include <array>
@@ -14,11 +14,12 @@
 
 namespace intabs {
 
-// Real-time safe: fixed memory, no call throws or blocks. One thread. Times are of one clock that never goes back.
+// Real-time safe: fixed memory, no call throws or blocks. One thread. Times are of one clock that never goes
+// back.
 class ArmController {
  public:
-  static constexpr int64_t kFaultAfterUs = 2000000;   // held without a command since it went stale
-  static constexpr int64_t kMaxLifetimeUs = 10000000;  // of a command: a longer one would switch the watchdog off
+  static constexpr int64_t kFaultAfterUs = 2000000;    // held without a command since it went stale
+  static constexpr int64_t kMaxLifetimeUs = 10000000;  // a longer one would switch the watchdog off
 
   ArmController(const ArmLimits& limits, const ArmModel& model) noexcept;
 
@@ -26,12 +27,12 @@ class ArmController {
   void Reset(const JointVector& q_measured, int64_t now_us) noexcept;
 
   // Takes a command, or refuses and counts it; a refused one changes nothing else.
-  //  - Session: a new one is adopted in Idle, or in Holding while no command of another session is still valid. After a
-  //    RESET only the session it named. In Fault and Stopped none.
+  //  - Session: a new one is adopted in Idle, or in Holding while no command of another session is valid.
+  //    After a RESET only the session it named. In Fault and Stopped none.
   //  - Mode, numbers, ranges. q_target within the joint limits; dq_max above the arm's limit is cut to it.
   //  - seq: higher than any before in the session.
-  // A command with mode kHold slows down and holds without a fault to come, as long as nobody commands otherwise; it leaves
-  // the gripper alone.
+  // A command with mode kHold slows down and holds without a fault to come, as long as nobody commands
+  // otherwise; it leaves the gripper alone.
   Refusal Accept(const ArmCommand& command, int64_t now_us) noexcept;
   // What Accept would answer.
   Refusal Check(const ArmCommand& command, int64_t now_us) const noexcept;
@@ -42,8 +43,8 @@ class ArmController {
   // Brakes within the limits and holds, latched until ResetFault.
   void Estop() noexcept;
 
-  // From Fault or Stopped to Holding; only `session` (> 0) may command next. Until it has, another RESET may name another
-  // one. Does nothing in other states.
+  // From Fault or Stopped to Holding; only `session` (> 0) may command next. Until it has, another RESET may
+  // name another one. Does nothing in other states.
   void ResetFault(int64_t session) noexcept;
 
   // Once per driver period (4 ms): watchdog, then one step of the filter.
@@ -62,7 +63,7 @@ class ArmController {
   void FillStatus(ArmStatus& status) const noexcept;
 
  private:
-  bool CommandIsValid(int64_t now_us) const noexcept { 
+  bool CommandIsValid(int64_t now_us) const noexcept {
     return lifetime_us_ > 0 && now_us - received_us_ <= lifetime_us_;
   }
 
@@ -81,7 +82,7 @@ class ArmController {
   JointVector dq_max_ = JointVector::Zero();
   int64_t received_us_ = 0;
   int64_t lifetime_us_ = 0;  // 0: no command is valid
-  bool stale_ = false;        // slows or holds because commands stopped coming
+  bool stale_ = false;       // slows or holds because commands stopped coming
   int64_t held_since_us_ = 0;
 
   std::array<int32_t, kNumRefusals> refused_{};

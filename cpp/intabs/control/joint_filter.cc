@@ -7,13 +7,13 @@ namespace intabs {
 namespace {
 
 constexpr double kDt = kDriverPeriodUs * 1e-6;
-// A target's step is followed like a first-order lag of this time constant [s]: as long as the policy's period, so that
-// the steps of 25 Hz melt into one motion.
+// A target's step is followed like a first-order lag of this time constant [s]: as long as the policy's
+// period, so that the steps of 25 Hz melt into one motion.
 constexpr double kTau = 0.04;
 constexpr double kArrived = 1e-7;  // [rad]: from here the target is reached in one tick, exactly
 
-// Speed towards a target at `distance` >= 0: distance / tau near it; farther away the square root of constant braking,
-// joined where both have the same slope, so that braking never asks for more than `a`.
+// Speed towards a target at `distance` >= 0: distance / tau near it; farther away the square root of constant
+// braking, joined where both have the same slope, so that braking never asks for more than `a`.
 double ApproachSpeed(double distance, double a) {
   const double knee = a * kTau * kTau;
   return distance <= knee ? distance / kTau : std::sqrt(2 * a * (distance - knee / 2));
@@ -68,16 +68,19 @@ void JointFilter::Step(const JointVector& wanted) noexcept {
   const double fit = wanted_speed > limits_.tcp_speed_max ? limits_.tcp_speed_max / wanted_speed : 1;
   JointVector next = within(wanted * fit);
 
-  // Never so fast that full braking would end beyond a limit. Where that held for the last tick it can be kept now: the
-  // speed it asks for is at most one dv below.
+  // Never so fast that full braking would end beyond a limit. Where that held for the last tick it can be
+  // kept now: the speed it asks for is at most one dv below.
   for (int i = 0; i < kNumJoints; ++i) {
-    const double up = std::min(limits_.dq_max[i], BrakingSpeed(limits_.q_max[i] - x_[i], limits_.ddq_max[i], kDt));
-    const double down = std::min(limits_.dq_max[i], BrakingSpeed(x_[i] - limits_.q_min[i], limits_.ddq_max[i], kDt));
+    const double up =
+        std::min(limits_.dq_max[i], BrakingSpeed(limits_.q_max[i] - x_[i], limits_.ddq_max[i], kDt));
+    const double down =
+        std::min(limits_.dq_max[i], BrakingSpeed(x_[i] - limits_.q_min[i], limits_.ddq_max[i], kDt));
     next[i] = std::clamp(next[i], -down, up);
   }
 
-  // While the joints are on their way to the wish, the TCP may still be too fast: take the largest part of it that is not.
-  // within() leaves every joint between `next` and full braking, so that all of the above still holds.
+  // While the joints are on their way to the wish, the TCP may still be too fast: take the largest part of it
+  // that is not. within() leaves every joint between `next` and full braking, so that all of the above still
+  // holds.
   if (tcp_speed(next) > limits_.tcp_speed_max) {
     double part = 0, too_much = 1;
     for (int i = 0; i < 12; ++i) {

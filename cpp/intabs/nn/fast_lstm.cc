@@ -42,7 +42,8 @@ void LstmStack::Normalise(int layer, const float* in, float* out) const noexcept
   for (int k = 0; k < n; ++k) out[k] = (in[k] - centre) * scale * weight[k] + bias[k];
 }
 
-// ---------------------------------------------------------------------------------------------------------- FastLstm
+// ----------------------------------------------------------------------------------------------------------
+// FastLstm
 
 FastLstm::FastLstm(const WeightsFile& file, const std::string& net, WeightFormat format, Isa isa)
     : stack_(file, net, format, isa) {
@@ -52,6 +53,7 @@ FastLstm::FastLstm(const WeightsFile& file, const std::string& net, WeightFormat
   c_.resize(states);
   x_.resize(stack_.padded_width());
   normalised_.resize(stack_.padded_width());
+  gates_.resize(4 * stack_.padded_hidden());
   scratch_.resize(stack_.kernels->scratch_bytes(stack_.padded_width(), 1) / sizeof(float) + 16);
 }
 
@@ -66,7 +68,7 @@ const float* FastLstm::Step(const float* x) noexcept {
       stack_.Normalise(l, x, normalised_.data());
       in = normalised_.data();
     }
-    stack_.kernels->step(stack_.cell(l), in, h, h_new, c, scratch_.data());
+    stack_.kernels->step(stack_.cell(l), in, h, h_new, c, gates_.data(), scratch_.data());
     if (stack_.spec.residual && l > 0) {
       float* sum = x_.data();
       for (int k = 0; k < hidden; ++k) sum[k] = x[k] + h_new[k];
@@ -100,8 +102,9 @@ void FastLstm::RestoreState(const float* in) noexcept {
   }
 }
 
-void FastLstm::Direction(int layer, int direction, const float* X, ptrdiff_t ld, int T, float* Y) noexcept {
-  auto& d = sequence_.direction[direction];
+void FastLstm::Direction(int layer, int direction, int room, const float* X, ptrdiff_t ld, int T,
+                         float* Y) noexcept {
+  auto& d = sequence_.room[room];
   const int hidden = stack_.spec.hidden;
   const Cell cell = stack_.cell(layer, direction);
   const ptrdiff_t ldg = static_cast<ptrdiff_t>(cell.panels) * kPanelGates;
@@ -112,7 +115,8 @@ void FastLstm::Direction(int layer, int direction, const float* X, ptrdiff_t ld,
   d.c.SetZero();
   for (int i = 0; i < T; ++i) {
     const int t = direction == 0 ? i : T - 1 - i;
-    stack_.kernels->step_from_gates(cell, d.gates.data() + t * ldg, h, h_new, d.c.data(), d.scratch.data());
+    stack_.kernels->step_from_gates(cell, d.gates.data() + t * ldg, h, h_new, d.c.data(), i % 2 == 1,
+                                    d.scratch.data());
     std::copy_n(h_new, hidden, Y + t * ld_out() + direction * hidden);
     std::swap(h, h_new);
   }
@@ -125,7 +129,7 @@ const float* FastLstm::Sequence(const float* X, ptrdiff_t ld, int T, int threads
     for (auto& rows : s.rows) rows.resize(columns * width);
     if (stack_.spec.layer_norm) s.normalised.resize(columns * width);
     for (int i = 0; i < stack_.directions(); ++i) {
-      auto& d = s.direction[i];
+      auto& d = s.room[i];
       d.gates.resize(columns * kPanelGates * stack_.cell(0).panels);
       d.h.resize(2 * stack_.padded_hidden());
       d.c.resize(stack_.padded_hidden());
@@ -144,9 +148,9 @@ const float* FastLstm::Sequence(const float* X, ptrdiff_t ld, int T, int threads
     }
     float* Y = s.rows[l % 2].data();
     if (stack_.directions() == 2 && threads > 1) {
-      second_.Run([&] { Direction(l, 0, in, ld_in, T, Y); }, [&] { Direction(l, 1, in, ld_in, T, Y); });
+      second_.Run([&] { Direction(l, 0, 0, in, ld_in, T, Y); }, [&] { Direction(l, 1, 1, in, ld_in, T, Y); });
     } else {
-      for (int i = 0; i < stack_.directions(); ++i) Direction(l, i, in, ld_in, T, Y);
+      for (int i = 0; i < stack_.directions(); ++i) Direction(l, i, 0, in, ld_in, T, Y);
     }
     if (stack_.spec.residual && l > 0) {
       for (int t = 0; t < T; ++t) {
@@ -159,7 +163,8 @@ const float* FastLstm::Sequence(const float* X, ptrdiff_t ld, int T, int threads
   return X;
 }
 
-// --------------------------------------------------------------------------------------------------------- LstmBatch
+// ---------------------------------------------------------------------------------------------------------
+// LstmBatch
 
 LstmBatch::LstmBatch(const LstmStack& stack, int n) : stack_(stack), n_(n), ldh_(stack.padded_hidden()) {
   const size_t columns = static_cast<size_t>(n);

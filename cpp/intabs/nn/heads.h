@@ -1,5 +1,6 @@
-// What a network's linear heads mean. Views: they hold indices and read the outputs of the network they are given, which
-// must be the one (or a copy of the one) they were made for. All but the constructors is real-time safe.
+// What a network's linear heads mean. Views: they hold indices and read the outputs of the network they are
+// given, which must be the one (or a copy of the one) they were made for. All but the constructors is
+// real-time safe.
 #pragma once
 
 #include <Eigen/Core>
@@ -26,7 +27,8 @@ class GaussianHead {
   int size() const noexcept { return static_cast<int>(fixed_.size()); }
   Eigen::Map<const Eigen::VectorXf> Mean(const Network& net) const noexcept { return net.Head(mean_); }
   Eigen::Map<const Eigen::VectorXf> LogStd(const Network& net) const noexcept {
-    return log_std_ >= 0 ? net.Head(log_std_) : Eigen::Map<const Eigen::VectorXf>(fixed_.data(), fixed_.size());
+    return log_std_ >= 0 ? net.Head(log_std_)
+                         : Eigen::Map<const Eigen::VectorXf>(fixed_.data(), fixed_.size());
   }
 
  private:

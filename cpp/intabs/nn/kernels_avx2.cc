@@ -63,7 +63,8 @@ struct Vec {
   static INTABS_INLINE F HighHalf(const char* p) {
     const I v = ILoad(p);
     const __m256i mask = _mm256_set1_epi32(static_cast<int>(0xffff0000));
-    return {_mm256_castsi256_ps(_mm256_and_si256(v.a, mask)), _mm256_castsi256_ps(_mm256_and_si256(v.b, mask))};
+    return {_mm256_castsi256_ps(_mm256_and_si256(v.a, mask)),
+            _mm256_castsi256_ps(_mm256_and_si256(v.b, mask))};
   }
   static INTABS_INLINE void Prefetch(const char* p) { _mm_prefetch(p, _MM_HINT_T0); }
 

@@ -33,13 +33,27 @@ struct Vec {
     return {{f, f, f, f}};
   }
   static INTABS_INLINE F Zero() { return Set1(0.0f); }
-  static INTABS_INLINE F Add(F x, F y) { return Each([&](int i) { return x.v[i] + y.v[i]; }); }
-  static INTABS_INLINE F Sub(F x, F y) { return Each([&](int i) { return x.v[i] - y.v[i]; }); }
-  static INTABS_INLINE F Mul(F x, F y) { return Each([&](int i) { return x.v[i] * y.v[i]; }); }
-  static INTABS_INLINE F Div(F x, F y) { return Each([&](int i) { return x.v[i] / y.v[i]; }); }
-  static INTABS_INLINE F Fma(F x, F y, F z) { return Each([&](int i) { return x.v[i] * y.v[i] + z.v[i]; }); }
-  static INTABS_INLINE F Min(F x, F y) { return Each([&](int i) { return x.v[i] < y.v[i] ? x.v[i] : y.v[i]; }); }
-  static INTABS_INLINE F Max(F x, F y) { return Each([&](int i) { return x.v[i] > y.v[i] ? x.v[i] : y.v[i]; }); }
+  static INTABS_INLINE F Add(F x, F y) {
+    return Each([&](int i) { return x.v[i] + y.v[i]; });
+  }
+  static INTABS_INLINE F Sub(F x, F y) {
+    return Each([&](int i) { return x.v[i] - y.v[i]; });
+  }
+  static INTABS_INLINE F Mul(F x, F y) {
+    return Each([&](int i) { return x.v[i] * y.v[i]; });
+  }
+  static INTABS_INLINE F Div(F x, F y) {
+    return Each([&](int i) { return x.v[i] / y.v[i]; });
+  }
+  static INTABS_INLINE F Fma(F x, F y, F z) {
+    return Each([&](int i) { return x.v[i] * y.v[i] + z.v[i]; });
+  }
+  static INTABS_INLINE F Min(F x, F y) {
+    return Each([&](int i) { return x.v[i] < y.v[i] ? x.v[i] : y.v[i]; });
+  }
+  static INTABS_INLINE F Max(F x, F y) {
+    return Each([&](int i) { return x.v[i] > y.v[i] ? x.v[i] : y.v[i]; });
+  }
   static INTABS_INLINE F Exponent(F t) {
     return Each([&](int i) { return (Float4)(((Int4)t.v[i] << 23) + 0x3f800000); });
   }
@@ -52,7 +66,8 @@ struct Vec {
   }
   template <int kByte>
   static INTABS_INLINE F Byte(const char* p) {
-    return Each([&](int i) { return __builtin_convertvector(Words(p, i) << (24 - 8 * kByte) >> 24, Float4); });
+    return Each(
+        [&](int i) { return __builtin_convertvector(Words(p, i) << (24 - 8 * kByte) >> 24, Float4); });
   }
   static INTABS_INLINE void Prefetch(const char* p) { __builtin_prefetch(p); }
 

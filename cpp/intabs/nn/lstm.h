@@ -1,8 +1,10 @@
-// Stacked LSTM in plain Eigen, float or double: the reference that the kernels (fast_lstm.h) are held against. Torch's
-// equations and gate order (torch.nn.LSTM):
-//   [i f g o] = W_ih x + W_hh h + b_ih + b_hh,  c' = sigmoid(f) c + sigmoid(i) tanh(g),  h' = sigmoid(o) tanh(c')
-// With `residual` a layer >= 1 hands up h' + its input; what it carries to the next tick stays h'. With `layer_norm` a
-// layer >= 1 reads the normalised input (torch.nn.LayerNorm); the residual path goes past the norm.
+// Stacked LSTM in plain Eigen, float or double: the reference that the kernels (fast_lstm.h) are held
+// against. Torch's equations and gate order (torch.nn.LSTM):
+//   [i f g o] = W_ih x + W_hh h + b_ih + b_hh,  c' = sigmoid(f) c + sigmoid(i) tanh(g),  h' = sigmoid(o)
+//   tanh(c')
+// With `residual` a layer >= 1 hands up h' + its input; what it carries to the next tick stays h'. With
+// `layer_norm` a layer >= 1 reads the normalised input (torch.nn.LayerNorm); the residual path goes past the
+// norm.
 #pragma once
 
 #include <Eigen/Core>
@@ -15,8 +17,8 @@
 
 namespace intabs {
 
-// One direction of one layer: a fused column-major matrix [W_ih W_hh] against [x; h], so that one pass over memory
-// serves both, and one bias.
+// One direction of one layer: a fused column-major matrix [W_ih W_hh] against [x; h], so that one pass over
+// memory serves both, and one bias.
 template <typename Scalar>
 class LstmCell {
  public:
@@ -89,7 +91,8 @@ class LayerNorm {
     const Scalar mean = x.mean();
     const Scalar variance = (x.array() - mean).square().mean();
     const Scalar scale = Scalar(1) / std::sqrt(variance + Scalar(kLayerNormEpsilon));
-    Eigen::Map<Vector>(out, weight_.size()) = ((x.array() - mean) * scale * weight_.array() + bias_.array()).matrix();
+    Eigen::Map<Vector>(out, weight_.size()) =
+        ((x.array() - mean) * scale * weight_.array() + bias_.array()).matrix();
   }
 
  private:
@@ -115,7 +118,8 @@ class Lstm {
   Lstm(const WeightsFile& file, const std::string& net)
       : residual_(file.manifest().network(net).residual), norms_(LayerNorms<Scalar>(file, net)) {
     const NetworkSpec& spec = file.manifest().network(net);
-    for (int l = 0; l < spec.layers; ++l) cells_.emplace_back(file, net + ".lstm." + std::to_string(l) + ".", "");
+    for (int l = 0; l < spec.layers; ++l)
+      cells_.emplace_back(file, net + ".lstm." + std::to_string(l) + ".", "");
     x_.setZero(spec.hidden);
     normalised_.setZero(spec.hidden);
   }
@@ -165,7 +169,8 @@ class Lstm {
   Eigen::Matrix<Scalar, Eigen::Dynamic, 1> x_, normalised_;
 };
 
-// Bidirectional stack, as torch's: a layer's output at t is [forward h(t), backward h(t)], which the next layer reads.
+// Bidirectional stack, as torch's: a layer's output at t is [forward h(t), backward h(t)], which the next
+// layer reads.
 template <typename Scalar>
 class BiLstm {
  public:

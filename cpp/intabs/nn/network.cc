@@ -54,15 +54,15 @@ Network::Network(const WeightsFile& file, const std::string& name, const Network
   head_out_.resize(heads_ld());
   x_.resize(spec_.input);
   top_.resize(spec_.layer_output());
-  scratch_.resize(kernels_->scratch_bytes(std::max(spec_.input, spec_.layer_output()), 1) / sizeof(float) + 16);
+  scratch_.resize(kernels_->scratch_bytes(std::max(spec_.input, spec_.layer_output()), 1) / sizeof(float) +
+                  16);
 }
 
-size_t Network::weight_bytes() const {
-  return input_.bytes() + lstm_.stack().cells.bytes() + heads_.bytes();
-}
+size_t Network::weight_bytes() const { return input_.bytes() + lstm_.stack().cells.bytes() + heads_.bytes(); }
 
 bool Network::HasHead(std::string_view name) const noexcept {
-  return std::any_of(spec_.heads.begin(), spec_.heads.end(), [&](const HeadSpec& h) { return h.name == name; });
+  return std::any_of(spec_.heads.begin(), spec_.heads.end(),
+                     [&](const HeadSpec& h) { return h.name == name; });
 }
 
 int Network::HeadIndex(std::string_view name) const {
@@ -71,7 +71,8 @@ int Network::HeadIndex(std::string_view name) const {
     if (head_name(i) == name) return i;
     known += (i > 0 ? ", " : "") + head_name(i);
   }
-  throw std::runtime_error("network \"" + name_ + "\" has no head \"" + std::string(name) + "\"; it has " + known);
+  throw std::runtime_error("network \"" + name_ + "\" has no head \"" + std::string(name) + "\"; it has " +
+                           known);
 }
 
 ptrdiff_t Network::heads_ld() const noexcept { return LinearWidth(heads_.cell(0)); }
@@ -86,7 +87,8 @@ Status Network::Step(const float* x) noexcept {
   CopyColumn(x, spec_.input, x_.data());
   const float* in = x_.data();
   if (input_.size() > 0) {
-    kernels_->input_gates(input_.cell(0), in, static_cast<ptrdiff_t>(x_.size()), 1, linear_.data(), scratch_.data());
+    kernels_->input_gates(input_.cell(0), in, static_cast<ptrdiff_t>(x_.size()), 1, linear_.data(),
+                          scratch_.data());
     in = linear_.data();
   }
   Heads(lstm_.Step(in), 0, 1, head_out_.data(), scratch_.data());
@@ -104,8 +106,9 @@ void Network::RestoreState(const float* in) noexcept {
 
 const float* Network::Top(const Eigen::Ref<const RowMatrixXf>& X, int threads) {
   if (X.cols() != spec_.input || X.rows() < 1) {
-    throw std::invalid_argument("network \"" + name_ + "\": the sequence is " + std::to_string(X.rows()) + "x" +
-                                std::to_string(X.cols()) + ", wanted Tx" + std::to_string(spec_.input) + ", T >= 1");
+    throw std::invalid_argument("network \"" + name_ + "\": the sequence is " + std::to_string(X.rows()) +
+                                "x" + std::to_string(X.cols()) + ", wanted Tx" + std::to_string(spec_.input) +
+                                ", T >= 1");
   }
   const int T = static_cast<int>(X.rows());
   const ptrdiff_t ld = RoundUp(spec_.input, 16);
@@ -140,12 +143,14 @@ void Network::EncodeFinal(const Eigen::Ref<const RowMatrixXf>& X, int threads) {
   Heads(top_.data(), 0, 1, head_out_.data(), scratch_.data());
 }
 
-// ------------------------------------------------------------------------------------------------------ NetworkBatch
+// ------------------------------------------------------------------------------------------------------
+// NetworkBatch
 
 NetworkBatch::NetworkBatch(const Network& net, int n) : net_(net), lstm_(net.lstm_.stack(), std::max(n, 1)) {
   if (n < 1) throw std::invalid_argument("a batch needs at least one rollout, not " + std::to_string(n));
   if (net.spec().bidirectional) {
-    throw std::invalid_argument("network \"" + net.name_ + "\" is bidirectional: it has no tick, and no batch");
+    throw std::invalid_argument("network \"" + net.name_ +
+                                "\" is bidirectional: it has no tick, and no batch");
   }
   x_.resize(static_cast<size_t>(n) * RoundUp(net.input_size(), 16));
   if (net.input_.size() > 0) linear_.resize(n * LinearWidth(net.input_.cell(0)));
@@ -158,7 +163,8 @@ Status NetworkBatch::Step(const float* X) noexcept {
   const int inputs = net_.input_size();
   if (!AllFinite(X, static_cast<ptrdiff_t>(size()) * inputs)) return Status::kInvalidInput;
   ptrdiff_t ld = RoundUp(inputs, 16);
-  for (int j = 0; j < size(); ++j) CopyColumn(X + static_cast<ptrdiff_t>(j) * inputs, inputs, x_.data() + j * ld);
+  for (int j = 0; j < size(); ++j)
+    CopyColumn(X + static_cast<ptrdiff_t>(j) * inputs, inputs, x_.data() + j * ld);
   const float* in = x_.data();
   if (net_.input_.size() > 0) {
     net_.kernels_->input_gates(net_.input_.cell(0), in, ld, size(), linear_.data(), scratch_.data());

@@ -1,9 +1,11 @@
-// A network of the manifest: [input linear] -> stacked LSTM -> named linear heads. float. Format: nn/weights.h.
+// A network of the manifest: [input linear] -> stacked LSTM -> named linear heads. float. Format:
+// nn/weights.h.
 //
 //   Network pi = Network::Load("models/weights/pick_place", "pi");       // throws, one line
 //   const int mean = pi.HeadIndex("agent_mean");                         // once, at set-up
 //   if (pi.Step(x) != Status::kOk) ...                                   // real-time safe
-//   pi.Head(mean)                                                        // float vector, valid until the next call
+//   pi.Head(mean)                                                        // float vector, valid until the
+//   next call
 //
 // A copy has its own state and its own weights. One thread at a time per object.
 #pragma once
@@ -22,7 +24,8 @@
 namespace intabs {
 
 struct NetworkOptions {
-  std::optional<WeightFormat> format;  // of the LSTM's weights; unset: the manifest's. The linear maps stay fp32
+  std::optional<WeightFormat> format =
+      std::nullopt;  // of the LSTM's weights; unset: the manifest's. The linear maps stay fp32
   Isa isa = BestIsa();
 };
 
@@ -41,27 +44,29 @@ class Network {
   bool HasHead(std::string_view name) const noexcept;
   int HeadIndex(std::string_view name) const;  // unknown: throws and lists the known ones
 
-  // One tick with carried state. x: input_size() values. kInvalidInput: a value is not finite, kNotReady: the network
-  // is bidirectional and has no tick; both leave state and heads alone. Real-time safe.
+  // One tick with carried state. x: input_size() values. kInvalidInput: a value is not finite, kNotReady: the
+  // network is bidirectional and has no tick; both leave state and heads alone. Real-time safe.
   Status Step(const float* x) noexcept;
   // Output of a head after Step or EncodeFinal. Real-time safe.
   Eigen::Map<const Eigen::VectorXf> Head(int head) const noexcept {
     return {head_out_.data() + head_offset_[head], head_size(head)};
   }
 
-  // State of the stack (none for a bidirectional network): h of every layer, then c of every layer. Real-time safe.
+  // State of the stack (none for a bidirectional network): h of every layer, then c of every layer. Real-time
+  // safe.
   void Reset() noexcept;
   int state_size() const;
   void SaveState(float* out) const noexcept;
   void RestoreState(const float* in) noexcept;
 
-  // A whole trajectory from zero state: X is T x input_size(), T >= 1, one time a row. Both leave the state of Step as
-  // it is, and throw std::invalid_argument on a wrong shape. heads[i] becomes T x head_size(i). threads = 2: one a
-  // direction of a bidirectional network. No allocation once T has been as large before (and the second thread, and
-  // `heads`, are there).
+  // A whole trajectory from zero state: X is T x input_size(), T >= 1, one time a row. Both leave the state
+  // of Step as it is, and throw std::invalid_argument on a wrong shape. heads[i] becomes T x head_size(i).
+  // threads = 2: one a direction of a bidirectional network. No allocation once T has been as large before
+  // (and the second thread, and `heads`, are there).
   void Sequence(const Eigen::Ref<const RowMatrixXf>& X, std::vector<RowMatrixXf>& heads, int threads = 1);
-  // For encoders: Head(i) afterwards is head i on the top layer's [forward output at T-1, backward output at 0], or on
-  // its output at T-1 if not bidirectional. (With `residual` the output includes the residual path.)
+  // For encoders: Head(i) afterwards is head i on the top layer's [forward output at T-1, backward output at
+  // 0], or on its output at T-1 if not bidirectional. (With `residual` the output includes the residual
+  // path.)
   void EncodeFinal(const Eigen::Ref<const RowMatrixXf>& X, int threads = 1);
 
  private:
@@ -82,8 +87,8 @@ class Network {
   AlignedFloats seq_x_, seq_linear_, seq_heads_, seq_scratch_;
 };
 
-// n copies of a network's state that step together, for planning: one set of weights (its own copy), which each tick
-// reads once for all. Real-time safe but for the constructor.
+// n copies of a network's state that step together, for planning: one set of weights (its own copy), which
+// each tick reads once for all. Real-time safe but for the constructor.
 class NetworkBatch {
  public:
   NetworkBatch(const Network& net, int n);  // throws if bidirectional or n < 1

@@ -1,5 +1,5 @@
-// A whole network in plain Eigen, float or double: what Network is held against, and what the error of the 16 and 8 bit
-// formats is measured against (double). Not real-time safe.
+// A whole network in plain Eigen, float or double: what Network is held against, and what the error of the 16
+// and 8 bit formats is measured against (double). Not real-time safe.
 #pragma once
 
 #include <optional>
@@ -34,7 +34,8 @@ class ReferenceNetwork {
 
   const NetworkSpec& spec() const { return spec_; }
 
-  // X: T x input, from zero state. heads[i]: T x size of head i. Returns the top layer's output, T x layer_output().
+  // X: T x input, from zero state. heads[i]: T x size of head i. Returns the top layer's output, T x
+  // layer_output().
   Rows Sequence(const Rows& X, std::vector<Rows>& heads) {
     const Rows in = input_ ? Map(*input_, X) : X;
     Rows top(X.rows(), spec_.layer_output());

@@ -1,9 +1,11 @@
-// A helper thread for work that splits in two. Started on first use (that allocates); later uses do not allocate.
-// A copy starts without a thread.
+// A helper thread for work that splits in two. Started on first use (that allocates); later uses do not
+// allocate. Where the helper does not get a CPU in time, the caller does both halves. A copy starts without a
+// thread.
 #pragma once
 
 #include <atomic>
 #include <thread>
+#include <type_traits>
 
 namespace intabs {
 
@@ -26,11 +28,16 @@ class SecondThread {
     argument_ = &theirs;
     Set(kWork);
     mine();
-    Await([](int s) { return s == kIdle; });
+    int expected = kWork;
+    if (state_.compare_exchange_strong(expected, kIdle, std::memory_order_acq_rel)) {
+      theirs();
+    } else {
+      Await([](int s) { return s == kIdle; });
+    }
   }
 
  private:
-  enum { kIdle, kWork, kQuit };
+  enum { kIdle, kWork, kBusy, kQuit };
 
   void Set(int s) {
     state_.store(s, std::memory_order_release);
@@ -46,7 +53,9 @@ class SecondThread {
     }
   }
   void Loop() {
-    while (Await([](int s) { return s != kIdle; }) == kWork) {
+    while (Await([](int s) { return s != kIdle; }) != kQuit) {
+      int expected = kWork;
+      if (!state_.compare_exchange_strong(expected, kBusy, std::memory_order_acq_rel)) continue;
       work_(argument_);
       Set(kIdle);
     }

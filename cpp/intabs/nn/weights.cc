@@ -78,10 +78,14 @@ std::string ShapeText(const std::vector<int64_t>& shape) {
 
 const char* Name(Dtype d) {
   switch (d) {
-    case Dtype::kF32: return "F32";
-    case Dtype::kF16: return "F16";
-    case Dtype::kBF16: return "BF16";
-    case Dtype::kI8: return "I8";
+    case Dtype::kF32:
+      return "F32";
+    case Dtype::kF16:
+      return "F16";
+    case Dtype::kBF16:
+      return "BF16";
+    case Dtype::kI8:
+      return "I8";
   }
   return "?";
 }
@@ -101,10 +105,14 @@ float Value(const Tensor& t, int64_t i) {
   const uint8_t* p = t.bytes.data() + i * Bytes(t.dtype);
   switch (t.dtype) {
     case Dtype::kF32:
-      return std::bit_cast<float>(uint32_t{p[0]} | uint32_t{p[1]} << 8 | uint32_t{p[2]} << 16 | uint32_t{p[3]} << 24);
-    case Dtype::kF16: return HalfToFloat(static_cast<uint16_t>(p[0] | p[1] << 8));
-    case Dtype::kBF16: return std::bit_cast<float>(uint32_t{p[0]} << 16 | uint32_t{p[1]} << 24);
-    case Dtype::kI8: return static_cast<float>(static_cast<int8_t>(p[0]));
+      return std::bit_cast<float>(uint32_t{p[0]} | uint32_t{p[1]} << 8 | uint32_t{p[2]} << 16 |
+                                  uint32_t{p[3]} << 24);
+    case Dtype::kF16:
+      return HalfToFloat(static_cast<uint16_t>(p[0] | p[1] << 8));
+    case Dtype::kBF16:
+      return std::bit_cast<float>(uint32_t{p[0]} << 16 | uint32_t{p[1]} << 24);
+    case Dtype::kI8:
+      return static_cast<float>(static_cast<int8_t>(p[0]));
   }
   return 0;
 }
@@ -149,10 +157,12 @@ WeightFormat ParseWeightFormat(std::string_view text) {
   if (text == "fp32") return WeightFormat::kFp32;
   if (text == "16") return WeightFormat::k16;
   if (text == "8") return WeightFormat::k8;
-  throw std::runtime_error("weight format " + Quoted(text) + " is unknown; there are \"fp32\", \"16\" and \"8\"");
+  throw std::runtime_error("weight format " + Quoted(text) +
+                           " is unknown; there are \"fp32\", \"16\" and \"8\"");
 }
 
-// ---------------------------------------------------------------------------------------------------------- Manifest
+// ----------------------------------------------------------------------------------------------------------
+// Manifest
 
 void Manifest::Fail(const std::string& what) const { Throw(label_, what); }
 
@@ -170,8 +180,11 @@ Manifest Manifest::Parse(std::string_view text, const std::string& label) {
     m.Fail("schema_version is " + std::to_string(version) + ", this program reads 1");
   }
   const json& networks = m.At("/networks");
-  if (!networks.is_object() || networks.empty()) m.Fail("\"/networks\" must be an object with at least one network");
-  for (const auto& [name, entry] : networks.items()) {
+  if (!networks.is_object() || networks.empty())
+    m.Fail("\"/networks\" must be an object with at least one network");
+  for (const auto& item : networks.items()) {
+    const std::string& name = item.key();
+    const json& entry = item.value();
     const std::string where = "network " + Quoted(name);
     if (!entry.is_object()) m.Fail(where + " is not an object");
     const auto integer = [&](const char* key, int low, int high, int otherwise) {
@@ -205,12 +218,14 @@ Manifest Manifest::Parse(std::string_view text, const std::string& label) {
       s.format = ParseWeightFormat(format->get<std::string>());
     }
     for (const auto& [key, value] : entry.items()) {
-      static const std::set<std::string> known = {"input",         "input_linear", "layers", "hidden", "residual",
-                                                  "bidirectional", "layer_norm",   "format", "heads"};
+      static const std::set<std::string> known = {"input",      "input_linear", "layers",
+                                                  "hidden",     "residual",     "bidirectional",
+                                                  "layer_norm", "format",       "heads"};
       if (!known.contains(key)) m.Fail(where + ": unknown key " + Quoted(key));
     }
     const auto heads = entry.find("heads");
-    if (heads == entry.end() || !heads->is_object()) m.Fail(where + ": \"heads\" must be an object {name: size}");
+    if (heads == entry.end() || !heads->is_object())
+      m.Fail(where + ": \"heads\" must be an object {name: size}");
     for (const auto& [head, size] : heads->items()) {
       if (!size.is_number_integer() || size.get<double>() < 1 || size.get<double>() > 65536) {
         m.Fail(where + ": the size of head " + Quoted(head) + " must be a whole number from 1 to 65536");
@@ -254,7 +269,8 @@ double Manifest::Number(const std::string& path) const {
 
 int64_t Manifest::Integer(const std::string& path) const {
   const json& v = At(path);
-  if (!v.is_number_integer() || std::abs(v.get<double>()) > 9e15) Fail(Quoted(path) + " is not a whole number");
+  if (!v.is_number_integer() || std::abs(v.get<double>()) > 9e15)
+    Fail(Quoted(path) + " is not a whole number");
   return v.get<int64_t>();
 }
 
@@ -306,7 +322,8 @@ std::vector<std::string> Manifest::Keys(const std::string& path) const {
   return out;
 }
 
-// ------------------------------------------------------------------------------------------------------- SafeTensors
+// -------------------------------------------------------------------------------------------------------
+// SafeTensors
 
 SafeTensors::SafeTensors(std::vector<uint8_t> file, const std::string& label) : file_(std::move(file)) {
   if (file_.size() < 8) {
@@ -314,28 +331,37 @@ SafeTensors::SafeTensors(std::vector<uint8_t> file, const std::string& label) : 
   }
   uint64_t header_size = 0;
   for (int i = 0; i < 8; ++i) header_size |= uint64_t{file_[i]} << (8 * i);
-  if (header_size > 100'000'000) Throw(label, "is not a safetensors file (header of " + std::to_string(header_size) + " bytes)");
+  if (header_size > 100'000'000)
+    Throw(label, "is not a safetensors file (header of " + std::to_string(header_size) + " bytes)");
   if (header_size > file_.size() - 8) {
     Throw(label, "is cut: " + std::to_string(file_.size()) + " bytes, its header alone needs " +
                      std::to_string(header_size + 8));
   }
-  const json header = ParseJson({reinterpret_cast<const char*>(file_.data()) + 8, header_size}, label + ": header");
+  const json header =
+      ParseJson({reinterpret_cast<const char*>(file_.data()) + 8, header_size}, label + ": header");
   const std::span<const uint8_t> data = std::span<const uint8_t>(file_).subspan(8 + header_size);
 
   std::map<uint64_t, std::pair<uint64_t, std::string>> ranges;  // begin -> end, name
   for (const auto& [name, entry] : header.items()) {
     if (name == "__metadata__") continue;
     const std::string where = "tensor " + Quoted(name);
-    if (!entry.is_object() || !entry.contains("dtype") || !entry.contains("shape") || !entry.contains("data_offsets")) {
+    if (!entry.is_object() || !entry.contains("dtype") || !entry.contains("shape") ||
+        !entry.contains("data_offsets")) {
       Throw(label, where + ": the header lacks dtype, shape or data_offsets");
     }
     Tensor t;
     const json& dtype = entry["dtype"];
-    if (dtype == "F32") t.dtype = Dtype::kF32;
-    else if (dtype == "F16") t.dtype = Dtype::kF16;
-    else if (dtype == "BF16") t.dtype = Dtype::kBF16;
-    else if (dtype == "I8") t.dtype = Dtype::kI8;
-    else Throw(label, where + " has dtype " + (dtype.is_string() ? Quoted(dtype.get<std::string>()) : "?") + ", wanted F32, F16, BF16 or I8");
+    if (dtype == "F32")
+      t.dtype = Dtype::kF32;
+    else if (dtype == "F16")
+      t.dtype = Dtype::kF16;
+    else if (dtype == "BF16")
+      t.dtype = Dtype::kBF16;
+    else if (dtype == "I8")
+      t.dtype = Dtype::kI8;
+    else
+      Throw(label, where + " has dtype " + (dtype.is_string() ? Quoted(dtype.get<std::string>()) : "?") +
+                       ", wanted F32, F16, BF16 or I8");
     const auto whole = [&](const json& v) {
       if (!v.is_number_unsigned() || v.get<uint64_t>() > (uint64_t{1} << 40)) {
         Throw(label, where + ": shape and data_offsets must be whole numbers");
@@ -369,7 +395,9 @@ SafeTensors::SafeTensors(std::vector<uint8_t> file, const std::string& label) : 
   }
   uint64_t at = 0;
   for (const auto& [begin, range] : ranges) {
-    if (begin != at) Throw(label, "tensor " + Quoted(range.second) + " begins at byte " + std::to_string(begin) + " of the data, wanted " + std::to_string(at));
+    if (begin != at)
+      Throw(label, "tensor " + Quoted(range.second) + " begins at byte " + std::to_string(begin) +
+                       " of the data, wanted " + std::to_string(at));
     at = range.first;
   }
   if (at != data.size()) {
@@ -377,14 +405,16 @@ SafeTensors::SafeTensors(std::vector<uint8_t> file, const std::string& label) : 
   }
 }
 
-// ------------------------------------------------------------------------------------------------------- WeightsFile
+// -------------------------------------------------------------------------------------------------------
+// WeightsFile
 
 WeightsFile WeightsFile::Load(const std::string& dir) {
   Manifest manifest = Manifest::Load(dir);
   return Parse(ReadFile(dir + "/weights.safetensors"), std::move(manifest), dir);
 }
 
-WeightsFile WeightsFile::Parse(std::vector<uint8_t> safetensors, Manifest manifest, const std::string& label) {
+WeightsFile WeightsFile::Parse(std::vector<uint8_t> safetensors, Manifest manifest,
+                               const std::string& label) {
   WeightsFile w;
   w.label_ = label;
   w.manifest_ = std::move(manifest);
@@ -398,7 +428,8 @@ WeightsFile WeightsFile::Parse(std::vector<uint8_t> safetensors, Manifest manife
   for (const auto& [net, spec] : w.manifest_.networks()) {
     for (const Wanted& want : WantedTensors(net, spec)) {
       const std::string where = "tensor " + Quoted(want.name);
-      const auto shape = want.cols > 0 ? std::vector<int64_t>{want.rows, want.cols} : std::vector<int64_t>{want.rows};
+      const auto shape =
+          want.cols > 0 ? std::vector<int64_t>{want.rows, want.cols} : std::vector<int64_t>{want.rows};
       const auto it = file.tensors().find(want.name);
       if (it == file.tensors().end()) {
         Throw(label, where + " is missing, the manifest wants " + ShapeText(shape));
@@ -415,7 +446,8 @@ WeightsFile WeightsFile::Parse(std::vector<uint8_t> safetensors, Manifest manife
         const std::string scale_name = want.name + ".scale";
         const int64_t scales = want.cols > 0 ? want.rows : 1;
         const auto scale = file.tensors().find(scale_name);
-        if (scale == file.tensors().end()) Throw(label, where + " is I8 and needs tensor " + Quoted(scale_name));
+        if (scale == file.tensors().end())
+          Throw(label, where + " is I8 and needs tensor " + Quoted(scale_name));
         if (scale->second.dtype != Dtype::kF32 || scale->second.shape != std::vector<int64_t>{scales}) {
           Throw(label, "tensor " + Quoted(scale_name) + " is " + ShapeText(scale->second.shape) + " " +
                            Name(scale->second.dtype) + ", wanted " + std::to_string(scales) + " F32");
@@ -434,7 +466,8 @@ WeightsFile WeightsFile::Parse(std::vector<uint8_t> safetensors, Manifest manife
   }
   for (const auto& [name, tensor] : file.tensors()) {
     if (!consumed.contains(name)) {
-      Throw(label, "tensor " + Quoted(name) + " (" + ShapeText(tensor.shape) + ") is in the file, but no network of the manifest wants it");
+      Throw(label, "tensor " + Quoted(name) + " (" + ShapeText(tensor.shape) +
+                       ") is in the file, but no network of the manifest wants it");
     }
   }
   return w;
@@ -449,8 +482,9 @@ WeightsFile WeightsFile::Random(const NetworkSpec& spec, unsigned seed) {
   std::uniform_real_distribution<float> value(-bound, bound);
   for (const Wanted& want : WantedTensors("net", spec)) {
     const bool gain = want.name.ends_with("norm.weight");  // of a layer norm: about 1
-    w.tensors_.emplace(want.name, RowMatrixXf::NullaryExpr(want.rows, std::max(want.cols, 1),
-                                                           [&] { return (gain ? 1.0f : 0.0f) + value(rng); }));
+    w.tensors_.emplace(want.name, RowMatrixXf::NullaryExpr(want.rows, std::max(want.cols, 1), [&] {
+                         return (gain ? 1.0f : 0.0f) + value(rng);
+                       }));
   }
   return w;
 }

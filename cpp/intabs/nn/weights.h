@@ -1,5 +1,6 @@
-// Weights folder: weights.safetensors and the manifest.json that says what must be in it. Nothing here is real-time
-// safe; everything throws std::runtime_error with one line that names file, tensor, found and expected.
+// Weights folder: weights.safetensors and the manifest.json that says what must be in it. Nothing here is
+// real-time safe; everything throws std::runtime_error with one line that names file, tensor, found and
+// expected.
 //
 // Manifest, as far as this room reads it:
 //   {"schema_version": 1,
@@ -7,8 +8,9 @@
 //    "networks": {"pi": {"input": 40, "input_linear": 128, "layers": 8, "hidden": 128, "residual": true,
 //                        "bidirectional": false, "layer_norm": false, "format": "fp32",
 //                        "heads": {"agent_mean": 7, "env_mean": 12}}}}
-// format: "fp32", "16" or "8", how the network runs unless the caller says otherwise. All but input, layers, hidden and
-// heads may be left out (0, false, fp32). Other keys belong to other rooms, which read them through Manifest.
+// format: "fp32", "16" or "8", how the network runs unless the caller says otherwise. All but input, layers,
+// hidden and heads may be left out (0, false, fp32). Other keys belong to other rooms, which read them
+// through Manifest.
 //
 // Tensors of network N, torch's names and layout, gates i, f, g, o:
 //   N.input.weight (input_linear, input), N.input.bias
@@ -60,7 +62,8 @@ struct NetworkSpec {
   int layer_input(int layer) const { return layer == 0 ? lstm_input() : layer_output(); }
 };
 
-// manifest.json. Paths are JSON pointers: "/normaliser/mean". A missing or wrong entry throws and names itself.
+// manifest.json. Paths are JSON pointers: "/normaliser/mean". A missing or wrong entry throws and names
+// itself.
 class Manifest {
  public:
   static Manifest Load(const std::string& dir);
@@ -72,7 +75,8 @@ class Manifest {
   int64_t Integer(const std::string& path) const;
   bool Bool(const std::string& path) const;
   std::string Text(const std::string& path) const;
-  std::vector<double> Numbers(const std::string& path) const;  // nested arrays flattened, row by row; all finite
+  std::vector<double> Numbers(
+      const std::string& path) const;  // nested arrays flattened, row by row; all finite
   std::vector<std::string> Texts(const std::string& path) const;
   std::vector<std::string> Keys(const std::string& path) const;  // of an object, sorted
 
@@ -110,9 +114,9 @@ class SafeTensors {
   std::map<std::string, Tensor, std::less<>> tensors_;
 };
 
-// A manifest and its weights, checked against each other: the hash, every tensor wanted is there in its shape, every
-// tensor there is wanted, every value finite. F32, F16 and BF16 become float; I8 comes with "<tensor>.scale" (F32, one
-// a row; one in all for a bias) and becomes scale * value.
+// A manifest and its weights, checked against each other: the hash, every tensor wanted is there in its
+// shape, every tensor there is wanted, every value finite. F32, F16 and BF16 become float; I8 comes with
+// "<tensor>.scale" (F32, one a row; one in all for a bias) and becomes scale * value.
 class WeightsFile {
  public:
   static WeightsFile Load(const std::string& dir);
@@ -122,7 +126,9 @@ class WeightsFile {
 
   const std::string& label() const { return label_; }  // the folder, for messages
   const Manifest& manifest() const { return manifest_; }
-  const RowMatrixXf& tensor(const std::string& name) const { return tensors_.at(name); }  // a vector is a column
+  const RowMatrixXf& tensor(const std::string& name) const {
+    return tensors_.at(name);
+  }  // a vector is a column
 
  private:
   std::string label_;

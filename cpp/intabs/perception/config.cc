@@ -70,7 +70,8 @@ Pose ReadPose(const cv::FileNode& node, const std::string& where) {
 PerceptionConfig Read(const cv::FileNode& root) {
   PerceptionConfig config;
   AllowOnly(root, "top level", {"cameras", "ground", "objects", "corner_sigma_px"});
-  if (!root["corner_sigma_px"].empty()) config.corner_sigma_px = Number(root["corner_sigma_px"], "corner_sigma_px");
+  if (!root["corner_sigma_px"].empty())
+    config.corner_sigma_px = Number(root["corner_sigma_px"], "corner_sigma_px");
 
   for (const cv::FileNode& node : Get(root, "top level", "cameras")) {
     const std::string at = "cameras[" + std::to_string(config.cameras.size()) + "]";
@@ -159,8 +160,8 @@ PerceptionConfig LoadPerceptionConfig(const std::string& path) {
   std::stringstream text;
   text << "%YAML:1.0\n---\n" << file.rdbuf();  // the heading that OpenCV insists on
   try {
-    const cv::FileStorage storage(text.str(), cv::FileStorage::READ | cv::FileStorage::MEMORY |
-                                                  cv::FileStorage::FORMAT_YAML);
+    const cv::FileStorage storage(
+        text.str(), cv::FileStorage::READ | cv::FileStorage::MEMORY | cv::FileStorage::FORMAT_YAML);
     PerceptionConfig config = Read(storage.root());
     Check(config);
     return config;

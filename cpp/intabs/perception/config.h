@@ -32,14 +32,16 @@ struct PerceptionConfig {
   std::vector<CameraModel> cameras;  // at most kMaxCameras
   std::optional<GroundTag> ground;   // needed unless every camera has its X_WC
   std::vector<ObjectModel> objects;
-  double corner_sigma_px = 0.1;      // standard deviation of a tag corner's coordinate
+  double corner_sigma_px = 0.05;  // standard deviation of a tag corner's coordinate
 };
 
-// Throws std::runtime_error that names the field and its value: no camera, a tag or slot used twice, sizes <= 0, ...
+// Throws std::runtime_error that names the field and its value: no camera, a tag or slot used twice, sizes <=
+// 0, ...
 void Check(const PerceptionConfig& config);
 
-// Reads and checks a file like models/config/perception.yaml. Throws std::runtime_error "FILE: what is wrong".
-// Read by OpenCV's own YAML reader, so that processes, bindings and tests share one loader without another library.
+// Reads and checks a file like models/config/perception.yaml. Throws std::runtime_error "FILE: what is
+// wrong". Read by OpenCV's own YAML reader, so that processes, bindings and tests share one loader without
+// another library.
 PerceptionConfig LoadPerceptionConfig(const std::string& path);
 
 }  // namespace intabs

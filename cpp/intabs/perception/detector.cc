@@ -105,7 +105,8 @@ struct TagDetector::Impl {
         tag.corners[k] = {d->p[k][0] - kHalfPixel + region.x, d->p[k][1] - kHalfPixel + region.y};
       }
       RefineCorners(gray, Pattern(tag.id), tag.corners);
-      const auto same = std::find_if(out.begin(), out.end(), [&](const SeenTag& t) { return t.id == tag.id; });
+      const auto same =
+          std::find_if(out.begin(), out.end(), [&](const SeenTag& t) { return t.id == tag.id; });
       if (same == out.end()) {
         out.push_back(tag);
       } else if (same->decision_margin < tag.decision_margin) {
@@ -121,7 +122,8 @@ TagDetector::~TagDetector() = default;
 TagDetector::TagDetector(TagDetector&&) noexcept = default;
 TagDetector& TagDetector::operator=(TagDetector&&) noexcept = default;
 
-const std::vector<SeenTag>& TagDetector::Detect(const cv::Mat& gray, std::span<const cv::Rect> expected, bool scan) {
+const std::vector<SeenTag>& TagDetector::Detect(const cv::Mat& gray, std::span<const cv::Rect> expected,
+                                                bool scan) {
   Impl& s = *impl_;
   s.last.swap(s.seen);
   s.seen.clear();

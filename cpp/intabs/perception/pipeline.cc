@@ -9,10 +9,12 @@
 namespace intabs {
 namespace {
 
-constexpr double kMovedPx = 3;         // the ground tag's RMS distance from its place that tells of a moved camera
-constexpr double kSameGroundPx = 1;    // while averaging: a larger step starts the mean again
+constexpr double kMovedPx = 3;  // the ground tag's RMS distance from its place that tells of a moved camera
+constexpr double kSameGroundPx = 1;  // while averaging: a larger step starts the mean again
 constexpr double kGroundAmbiguity = 0.6;
-constexpr double kFacing = 0.1;        // cosine; tags seen more obliquely are not looked for
+constexpr double kGroundSame =
+    5 * M_PI / 180;                     // seen face on, the two hypotheses grow together: either will do
+constexpr double kFacing = 0.1;         // cosine; tags seen more obliquely are not looked for
 constexpr double kObjectMarginPx = 24;  // 0.5 m/s at 0.6 m is 20 px a frame at 25 Hz
 constexpr double kGroundMarginPx = 6;
 constexpr int kSlowScan = 4;  // what is missing for long is looked for in each camera every so many frames
@@ -100,7 +102,9 @@ void Pipeline::Place(Camera& camera) {
       mean[k] = camera.ground_sum[k] / camera.ground_frames;
     }
     const TagPose pose = SolveTag(camera.model, ground.size, mean);
-    if (pose.ok && pose.ambiguity <= kGroundAmbiguity) {
+    const bool clear =
+        pose.ambiguity <= kGroundAmbiguity || AngleBetween(pose.X_CT[0].q, pose.X_CT[1].q) < kGroundSame;
+    if (pose.ok && clear) {
       camera.X_WC = ground.X_WT * pose.X_CT[0].Inverse();
     } else {
       camera.ground_frames = 0;
@@ -155,9 +159,10 @@ void Pipeline::Process(const GrayImages& images, int64_t frame_seq, int64_t expo
   for (size_t c = 0; c < images.size(); ++c) {
     const CameraModel& model = cameras_[c].model;
     if (!images[c].empty() && (images[c].cols != model.width || images[c].rows != model.height)) {
-      throw std::runtime_error("perception: camera " + model.name + " gave " + std::to_string(images[c].cols) + " x " +
-                               std::to_string(images[c].rows) + " px, the configuration says " +
-                               std::to_string(model.width) + " x " + std::to_string(model.height));
+      throw std::runtime_error("perception: camera " + model.name + " gave " +
+                               std::to_string(images[c].cols) + " x " + std::to_string(images[c].rows) +
+                               " px, the configuration says " + std::to_string(model.width) + " x " +
+                               std::to_string(model.height));
     }
   }
   if (seq_ == 0 || exposure_us < last_us_) tracks_.fill({});
@@ -167,8 +172,10 @@ void Pipeline::Process(const GrayImages& images, int64_t frame_seq, int64_t expo
   for (size_t c = 0; c < cameras_.size(); ++c) {
     Camera& camera = cameras_[c];
     const auto start = std::chrono::steady_clock::now();
-    camera.seen = camera.detector.Detect(images[c], Expected(camera, exposure_us), ScanDue(static_cast<int>(c)));
-    camera.detect_us = std::chrono::duration<double, std::micro>(std::chrono::steady_clock::now() - start).count();
+    camera.seen =
+        camera.detector.Detect(images[c], Expected(camera, exposure_us), ScanDue(static_cast<int>(c)));
+    camera.detect_us =
+        std::chrono::duration<double, std::micro>(std::chrono::steady_clock::now() - start).count();
     Place(camera);
 
     TagDetections& d = detections[c];

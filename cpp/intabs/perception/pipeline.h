@@ -1,5 +1,6 @@
-// Grey frames of all cameras in, object poses in W out. The same code runs in intabs_perception, in in-process
-// rollouts and in dataset preprocessing. Single thread; the answer depends on the sequence of frames alone.
+// Grey frames of all cameras in, object poses in W out. The same code runs in intabs_perception, in
+// in-process rollouts and in dataset preprocessing. Single thread; the answer depends on the sequence of
+// frames alone.
 #pragma once
 
 #include <array>
@@ -21,7 +22,8 @@ using CameraDetections = std::array<TagDetections, kMaxCameras>;
 
 class Pipeline {
  public:
-  // A pose stays valid for so long after the last frame that showed it: arm and fingers hide tags for moments.
+  // A pose stays valid for so long after the last frame that showed it: arm and fingers hide tags for
+  // moments.
   static constexpr int64_t kHoldUs = 500000;
   // The camera's place is the mean over so many frames of the ground tag, then fixed.
   static constexpr int kGroundFrames = 10;
@@ -30,14 +32,15 @@ class Pipeline {
 
   // out: every configured object, in its slot.
   //   Seen: pose and covariance of this frame, cameras that contributed, age 0, valid.
-  //   Not seen, or its views contradict each other: the last pose with age growing, cameras 0; valid up to an age of
+  //   Not seen, or its views contradict each other: the last pose with age growing, cameras 0; valid up to an
+  //   age of
   //     kHoldUs, invalid after it (the pose is kept, the age grows on).
   //   Never seen: as an unused slot (id -1, null pose, invalid, age 0).
-  // A camera contributes once the ground tag showed where it stands, and not in a frame that shows the ground tag
-  // elsewhere (moved camera, swapped cables).
-  // detections: what each camera saw, at most kMaxTags each, sorted by id.
-  // utime of both is exposure_us; seq counts the calls. An exposure earlier than the last one forgets all poses.
-  // Throws std::runtime_error when the number, size or type of the images does not fit the configuration.
+  // A camera contributes once the ground tag showed where it stands, and not in a frame that shows the ground
+  // tag elsewhere (moved camera, swapped cables). detections: what each camera saw, at most kMaxTags each,
+  // sorted by id. utime of both is exposure_us; seq counts the calls. An exposure earlier than the last one
+  // forgets all poses. Throws std::runtime_error when the number, size or type of the images does not fit the
+  // configuration.
   void Process(const GrayImages& images, int64_t frame_seq, int64_t exposure_us, ObjectPoses& out,
                CameraDetections& detections);
 
@@ -48,7 +51,9 @@ class Pipeline {
   std::optional<Pose> X_WC(int camera) const;  // unset: the ground tag was not seen yet
   // False when the last frame showed the ground tag over 3 px off its place.
   bool in_place(int camera) const { return cameras_[camera].in_place; }
-  double detect_us(int camera) const { return cameras_[camera].detect_us; }  // tag detection of the last frame
+  double detect_us(int camera) const {
+    return cameras_[camera].detect_us;
+  }  // tag detection of the last frame
 
  private:
   struct Camera {

@@ -9,15 +9,16 @@
 namespace intabs {
 namespace {
 
-// The tag's plane in units of half its black edge: x right, y down, the black edge at +-1, the white border to 1.25.
+// The tag's plane in units of half its black edge: x right, y down, the black edge at +-1, the white border
+// to 1.25.
 constexpr double kCellsPerUnit = 4;
-constexpr double kUsed = 1.125;           // half the white border; beyond it the background shines in
-constexpr int kPixels = 1000;             // larger tags are sampled
+constexpr double kUsed = 1.125;  // half the white border; beyond it the background shines in
+constexpr int kPixels = 2000;    // of the bounding box; larger tags are sampled
 constexpr int kIterations = 10;
-constexpr double kRobust = 0.15;          // of the contrast: residuals from there on lose weight
-constexpr double kMaxResidual = 0.12;     // of the contrast
-constexpr double kMinContrast = 10;       // grey levels
-constexpr double kMaxMove = 3.5;          // px
+constexpr double kRobust = 0.15;                 // of the contrast: residuals from there on lose weight
+constexpr double kMaxResidual = 0.12;            // of the contrast
+constexpr double kMinContrast = 10;              // grey levels
+constexpr double kMaxMove = 3.5;                 // px
 constexpr double kMinBlur = 0.25, kMaxBlur = 2;  // px
 
 // Homography from the tag's plane to pixels.
@@ -38,26 +39,26 @@ Eigen::Matrix3d FromCorners(const TagCorners& corners) {
   return H;
 }
 
-// How much of each cell a blurred look at place c (in cells) sees: weight, d weight/dc, d weight/ds for blur s. The
-// blur's density is (1 - z^2)^2 over +-1, z = distance / (2.65 s): like a Gaussian of sigma s, but it ends.
+// How much of each cell a look at place c (in cells), blurred by a Gaussian of sigma s, sees: weight, d
+// weight/dc, d weight/ds.
 struct Cells {
   int from = 0, to = 0;  // cells [from, to) are seen
   float weight[10], slope[10], widen[10];
 
   void Look(float c, float s) {
-    const float reach = 2.6457513f * s;
+    const float reach = 3.5f * s;
     from = std::clamp(static_cast<int>(std::floor(c - reach)), 0, 9);
     to = std::clamp(static_cast<int>(std::floor(c + reach)), 0, 9) + 1;
+    const float is = 1 / s;
     float below = 0, below_c = 0, below_s = 0;  // of the part that lies before cell i
     for (int i = from; i < to; ++i) {
       float part = 1, part_c = 0, part_s = 0;
       if (i + 1 < to) {  // the last one takes all the rest: the border is taken to go on
-        const float z = std::clamp((i + 1 - c) / reach, -1.f, 1.f);
-        const float zz = z * z, q = 1 - zz;
-        part = 0.5f + z * (15 - 10 * zz + 3 * zz * zz) / 16;
-        const float density = 15.f / 16 * q * q / reach;
+        const float z = (i + 1 - c) * is;
+        const float density = 0.3989423f * std::exp(-0.5f * z * z) * is;
+        part = 0.5f + 0.5f * std::erf(0.70710678f * z);
         part_c = -density;
-        part_s = -density * z * reach / s;
+        part_s = -density * z;
       }
       weight[i] = part - below;
       slope[i] = part_c - below_c;
@@ -70,11 +71,11 @@ struct Cells {
 };
 
 struct Sample {
-  float x, y;       // in the tag's plane
-  float value;      // grey level of the image
-  float model;      // 0 black .. 1 white
-  float dx, dy;     // of the model by x and y
-  float ds;         // of the model by the blur in px
+  float x, y;    // in the tag's plane
+  float value;   // grey level of the image
+  float model;   // 0 black .. 1 white
+  float dx, dy;  // of the model by x and y
+  float ds;      // of the model by the blur in px
 };
 
 }  // namespace
@@ -105,7 +106,7 @@ bool RefineCorners(const cv::Mat& gray, const TagPattern& pattern, TagCorners& c
     const int v1 = std::min(gray.rows - 1, static_cast<int>(std::floor(hi.y())));
     if (u1 < u0 || v1 < v0) return false;
     const double area = static_cast<double>(u1 - u0 + 1) * (v1 - v0 + 1);
-    const int stride = std::max(1, static_cast<int>(std::sqrt(area / kPixels)));
+    const int stride = std::max(1, static_cast<int>(std::ceil(std::sqrt(area / kPixels))));
 
     // What the model says of every pixel.
     const Eigen::Matrix3f Hi = H.inverse().cast<float>();

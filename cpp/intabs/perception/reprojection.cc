@@ -50,7 +50,8 @@ std::array<Eigen::Vector3d, 4> TagPoints(double size) {
   return {{{-h, h, 0}, {h, h, 0}, {h, -h, 0}, {-h, -h, 0}}};
 }
 
-double ReprojectionRms(std::span<const PlacedCamera> cameras, std::span<const PointView> points, const Pose& X_WO) {
+double ReprojectionRms(std::span<const PlacedCamera> cameras, std::span<const PointView> points,
+                       const Pose& X_WO) {
   return std::sqrt(Linearise(cameras, points, X_WO, nullptr, nullptr) / points.size());
 }
 

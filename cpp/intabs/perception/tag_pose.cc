@@ -7,12 +7,12 @@
 namespace intabs {
 namespace {
 
-// The pose that looks the same under weak perspective: the tag's x and y axes keep what they show to the camera and
-// lose the sign of their depth along the line of sight.
+// The pose that looks the same under weak perspective: the tag's x and y axes keep what they show to the
+// camera and lose the sign of their depth along the line of sight.
 Pose Mirror(const Pose& X_CT) {
   const Eigen::Vector3d s = X_CT.p.normalized();
-  const Eigen::Matrix3d R = (Eigen::Matrix3d::Identity() - 2 * s * s.transpose()) * X_CT.q.toRotationMatrix() *
-                            Eigen::Vector3d(1, 1, -1).asDiagonal();
+  const Eigen::Matrix3d R = (Eigen::Matrix3d::Identity() - 2 * s * s.transpose()) *
+                            X_CT.q.toRotationMatrix() * Eigen::Vector3d(1, 1, -1).asDiagonal();
   return {X_CT.p, Eigen::Quaterniond(R).normalized()};
 }
 

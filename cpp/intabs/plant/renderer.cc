@@ -13,14 +13,16 @@ namespace intabs {
 namespace {
 
 EGLDisplay OpenDisplay() {
-  const auto get = reinterpret_cast<PFNEGLGETPLATFORMDISPLAYEXTPROC>(eglGetProcAddress("eglGetPlatformDisplayEXT"));
+  const auto get =
+      reinterpret_cast<PFNEGLGETPLATFORMDISPLAYEXTPROC>(eglGetProcAddress("eglGetPlatformDisplayEXT"));
   if (get != nullptr) {
     const EGLDisplay display = get(EGL_PLATFORM_SURFACELESS_MESA, EGL_DEFAULT_DISPLAY, nullptr);
     if (display != EGL_NO_DISPLAY && eglInitialize(display, nullptr, nullptr)) return display;
   }
   const EGLDisplay display = eglGetDisplay(EGL_DEFAULT_DISPLAY);
   if (display != EGL_NO_DISPLAY && eglInitialize(display, nullptr, nullptr)) return display;
-  throw std::runtime_error("no EGL display: install libegl1, libegl-mesa0 and libgl1-mesa-dri, or run without cameras");
+  throw std::runtime_error(
+      "no EGL display: install libegl1, libegl-mesa0 and libgl1-mesa-dri, or run without cameras");
 }
 
 }  // namespace
@@ -59,15 +61,28 @@ Renderer::Renderer(const World& world, int width, int height) : impl_(std::make_
   const mjModel* m = r.model.get();
   if (width < 1 || height < 1 || width > m->vis.global.offwidth || height > m->vis.global.offheight) {
     throw std::runtime_error("pictures of " + std::to_string(width) + "x" + std::to_string(height) +
-                             " do not fit the scene's offscreen buffer of " + std::to_string(m->vis.global.offwidth) +
-                             "x" + std::to_string(m->vis.global.offheight));
+                             " do not fit the scene's offscreen buffer of " +
+                             std::to_string(m->vis.global.offwidth) + "x" +
+                             std::to_string(m->vis.global.offheight));
   }
   r.data = mj_makeData(m);
   r.display = OpenDisplay();
-  const EGLint attributes[] = {EGL_RED_SIZE,     8,  EGL_GREEN_SIZE,      8,
-                               EGL_BLUE_SIZE,    8,  EGL_ALPHA_SIZE,      8,
-                               EGL_DEPTH_SIZE,   24, EGL_STENCIL_SIZE,    8,
-                               EGL_SURFACE_TYPE, EGL_PBUFFER_BIT, EGL_RENDERABLE_TYPE, EGL_OPENGL_BIT,
+  const EGLint attributes[] = {EGL_RED_SIZE,
+                               8,
+                               EGL_GREEN_SIZE,
+                               8,
+                               EGL_BLUE_SIZE,
+                               8,
+                               EGL_ALPHA_SIZE,
+                               8,
+                               EGL_DEPTH_SIZE,
+                               24,
+                               EGL_STENCIL_SIZE,
+                               8,
+                               EGL_SURFACE_TYPE,
+                               EGL_PBUFFER_BIT,
+                               EGL_RENDERABLE_TYPE,
+                               EGL_OPENGL_BIT,
                                EGL_NONE};
   EGLConfig config;
   EGLint n = 0;
@@ -106,7 +121,8 @@ void Renderer::Render(const Snapshot& s, int camera, uint8_t* rgb) {
   const mjModel* m = r.model.get();
   Restore(s, m, r.data);
   // Several renderers may live in one process.
-  if (eglGetCurrentContext() != r.context) eglMakeCurrent(r.display, EGL_NO_SURFACE, EGL_NO_SURFACE, r.context);
+  if (eglGetCurrentContext() != r.context)
+    eglMakeCurrent(r.display, EGL_NO_SURFACE, EGL_NO_SURFACE, r.context);
   mjvCamera view;
   mjv_defaultCamera(&view);
   view.type = mjCAMERA_FIXED;
@@ -116,7 +132,8 @@ void Renderer::Render(const Snapshot& s, int camera, uint8_t* rgb) {
   mjr_render(viewport, &r.scene, &r.gl);
   mjr_readPixels(rgb, nullptr, viewport, &r.gl);
   const int row = 3 * r.width;  // OpenGL's row 0 is at the bottom
-  for (int y = 0; y < r.height / 2; ++y) std::swap_ranges(rgb + y * row, rgb + (y + 1) * row, rgb + (r.height - 1 - y) * row);
+  for (int y = 0; y < r.height / 2; ++y)
+    std::swap_ranges(rgb + y * row, rgb + (y + 1) * row, rgb + (r.height - 1 - y) * row);
 }
 
 }  // namespace intabs

@@ -17,7 +17,9 @@ namespace intabs {
 class Random {
  public:
   explicit Random(uint64_t seed) : engine_(seed) {}
-  double Uniform(double a, double b) { return a + (b - a) * (static_cast<double>(engine_() >> 11) * 0x1p-53); }
+  double Uniform(double a, double b) {
+    return a + (b - a) * (static_cast<double>(engine_() >> 11) * 0x1p-53);
+  }
 
  private:
   std::mt19937_64 engine_;
@@ -25,14 +27,14 @@ class Random {
 
 // An object that perception and control know, by slot.
 struct TaskObject {
-  std::string body;  // in the scene; a free body or a mocap body
-  int id = 0;        // in OBJECT_POSES
+  std::string body;    // in the scene; a free body or a mocap body
+  int id = 0;          // in OBJECT_POSES
   double azimuth = 0;  // nominal place about the base [rad], the object's x axis points away from the base
   double radius = 0;   // [m]
   double height = 0;   // of the body's frame [m]
 };
 
-// What a task may look at. Indices are resolved once.
+// What a task may look at, by the names of the scene. That its objects are there is checked when the World is made.
 struct TaskView {
   const mjModel* model = nullptr;
   const mjData* data = nullptr;

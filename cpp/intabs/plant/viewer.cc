@@ -70,9 +70,10 @@ Viewer::Viewer(const World& world) : impl_(std::make_unique<Impl>()) {
     v.window = glfwCreateWindow(1200, 900, "intabs_plant", nullptr, nullptr);
   }
   if (v.window == nullptr) {
-    const char* reason = "unknown reason";
+    const char* reason = nullptr;
     glfwGetError(&reason);
-    throw std::runtime_error("the viewer gets no window (" + std::string(reason != nullptr ? reason : "unknown reason") +
+    throw std::runtime_error("the viewer gets no window (" +
+                             std::string(reason != nullptr ? reason : "no reason given") +
                              "): start it where there is a display, or without --viewer");
   }
   glfwMakeContextCurrent(v.window);
@@ -123,7 +124,8 @@ namespace intabs {
 
 struct Viewer::Impl {};
 Viewer::Viewer(const World&) {
-  throw std::runtime_error("built without a viewer: install libglfw3-dev and build again, or run without --viewer");
+  throw std::runtime_error(
+      "built without a viewer: install libglfw3-dev and build again, or run without --viewer");
 }
 Viewer::~Viewer() = default;
 bool Viewer::Show(const Snapshot&) { return false; }

@@ -2,6 +2,7 @@
 
 #include <mujoco/mujoco.h>
 
+#include <algorithm>
 #include <cstring>
 #include <stdexcept>
 
@@ -10,22 +11,25 @@
 namespace intabs {
 namespace {
 
-constexpr double kServoLead = 0.02;    // kv / kp of the servos [s]
-constexpr double kGripperForce = 10;   // [N]
-constexpr double kOpen = 0.0089;       // of a finger [m]
-constexpr double kClearance = 0.09;    // between objects at the start [m]
-constexpr int kPhysicsSteps = 2;       // a driver tick
+constexpr double kServoLead = 0.02;   // kv / kp of the servos [s]
+constexpr double kGripperForce = 10;  // [N]
+constexpr double kOpen = 0.0089;      // of a finger [m]
+constexpr double kClearance = 0.09;   // between objects at the start [m]
+constexpr int kPhysicsSteps = 2;      // a driver tick
 
-int Find(const mjModel* m, mjtObj type, const std::string& name) {
-  const int id = mj_name2id(m, type, name.c_str());
-  if (id < 0) throw std::runtime_error("the scene has no " + std::string(mju_type2Str(type)) + " \"" + name + "\"");
-  return id;
+std::string ScenePath(const std::string& models_dir, const std::string& task) {
+  return models_dir + "/scenes/" + task + ".xml";
 }
 
 std::shared_ptr<mjModel> LoadModel(const std::string& path) {
   char error[1000] = "";
   mjModel* m = mj_loadXML(path.c_str(), nullptr, error, sizeof(error));
-  if (m == nullptr) throw std::runtime_error(path + ": " + error);
+  if (m == nullptr) {
+    std::string line = path + ": " + error;  // MuJoCo likes several
+    while (!line.empty() && line.back() == '\n') line.pop_back();
+    std::replace(line.begin(), line.end(), '\n', ' ');
+    throw std::runtime_error(line);
+  }
   return {m, mj_deleteModel};
 }
 
@@ -37,25 +41,36 @@ JointVector World::Home() {
 
 World::World(const std::string& models_dir, const std::string& task)
     : task_(FindTask(task)),
-      model_(LoadModel(models_dir + "/scenes/" + task + ".xml")),
+      model_(LoadModel(ScenePath(models_dir, task))),
       data_(mj_makeData(model_.get()), mj_deleteData) {
   const mjModel* m = model_.get();
+  const std::string path = ScenePath(models_dir, task);
+  const auto find = [&](mjtObj type, const std::string& name) {
+    const int id = mj_name2id(m, type, name.c_str());
+    if (id < 0) throw std::runtime_error(path + ": has no " + mju_type2Str(type) + " \"" + name + "\"");
+    return id;
+  };
   for (int i = 0; i < kNumJoints; ++i) {
     const std::string name = "joint" + std::to_string(i + 1);
-    const int j = Find(m, mjOBJ_JOINT, name);
+    const int j = find(mjOBJ_JOINT, name);
     joint_qpos_[i] = m->jnt_qposadr[j];
     joint_dof_[i] = m->jnt_dofadr[j];
-    joint_actuator_[i] = Find(m, mjOBJ_ACTUATOR, name);
+    joint_actuator_[i] = find(mjOBJ_ACTUATOR, name);
     compensated_dofs_.push_back(joint_dof_[i]);
   }
   const std::array<std::string, 2> fingers = {"finger_left", "finger_right"};
   for (int i = 0; i < 2; ++i) {
-    const int j = Find(m, mjOBJ_JOINT, fingers[i]);
+    const int j = find(mjOBJ_JOINT, fingers[i]);
     finger_qpos_[i] = m->jnt_qposadr[j];
     compensated_dofs_.push_back(m->jnt_dofadr[j]);
   }
-  gripper_actuator_ = Find(m, mjOBJ_ACTUATOR, "gripper");
-  for (const TaskObject& o : task_.objects()) Find(m, mjOBJ_BODY, o.body);
+  gripper_actuator_ = find(mjOBJ_ACTUATOR, "gripper");
+  for (const TaskObject& o : task_.objects()) {
+    const int b = find(mjOBJ_BODY, o.body), j = m->body_jntadr[b];
+    if (m->body_mocapid[b] < 0 && (j < 0 || m->jnt_type[j] != mjJNT_FREE)) {
+      throw std::runtime_error(path + ": body \"" + o.body + "\" must have a freejoint or be a mocap body");
+    }
+  }
   Reset(0, 0);
 }
 
@@ -84,8 +99,8 @@ void World::Reset(int64_t seed, double spread_cm) {
     for (size_t i = 0; i < objects.size(); ++i) {
       const TaskObject& o = objects[i];
       const double r = spread * std::sqrt(random.Uniform(0, 1)), a = random.Uniform(-M_PI, M_PI);
-      poses[i].p << o.radius * std::cos(o.azimuth) + r * std::cos(a), o.radius * std::sin(o.azimuth) + r * std::sin(a),
-          o.height;
+      poses[i].p << o.radius * std::cos(o.azimuth) + r * std::cos(a),
+          o.radius * std::sin(o.azimuth) + r * std::sin(a), o.height;
       poses[i].q = ExpSO3({0, 0, o.azimuth + random.Uniform(-yaw_limit, yaw_limit)});
     }
     clear = true;

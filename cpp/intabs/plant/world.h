@@ -1,5 +1,5 @@
-// MuJoCo behind the arm's joints: one task's world. Deterministic: the same seed and targets give the same states.
-// One thread at a time. Nothing here is real-time safe.
+// MuJoCo behind the arm's joints: one task's world. Deterministic: the same seed and targets give the same
+// states. One thread at a time. Nothing here is real-time safe.
 #pragma once
 
 #include <array>
@@ -43,8 +43,8 @@ class World {
   World(const World&) = delete;
   World& operator=(const World&) = delete;
 
-  // Time zero, arm at home with open gripper, each object uniform in a disc of `spread_cm` about its nominal place,
-  // yaw uniform within 3 degrees per cm (30 at most).
+  // Time zero, arm at home with open gripper, each object uniform in a disc of `spread_cm` about its nominal
+  // place, yaw uniform within 3 degrees per cm (30 at most).
   void Reset(int64_t seed, double spread_cm);
 
   // One driver tick: 4 ms, gravity compensated servos.
@@ -55,7 +55,7 @@ class World {
   std::array<TrackedObject, kMaxObjects> Objects() const;  // the truth: valid, no covariance, age 0
 
   std::vector<std::string> SubgoalNames() const;
-  uint32_t Subgoals() const;          // those that hold now
+  uint32_t Subgoals() const;  // those that hold now
   bool Success() const;
   std::string FailureReason() const;  // empty when it is a success
   uint64_t StateHash() const;         // of positions and velocities

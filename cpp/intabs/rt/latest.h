@@ -6,18 +6,17 @@
 
 namespace intabs {
 
-// Triple buffer for one writer and one reader thread. The three values live as long as the slot and are reused, so that
-// what they own is allocated once. Real-time safe as far as T's own writes are.
+// Triple buffer for one writer and one reader thread. The three values live as long as the slot and are
+// reused, so that what they own is allocated once. Real-time safe as far as T's own writes are.
 template <class T>
 class Latest {
  public:
   // Writer: fill this, then Publish(). It holds an old value.
   T& write_slot() noexcept { return values_[write_]; }
-  void Publish() noexcept {
-    write_ = shared_.exchange(write_ | kNew, std::memory_order_acq_rel) & ~kNew;
-  }
+  void Publish() noexcept { write_ = shared_.exchange(write_ | kNew, std::memory_order_acq_rel) & ~kNew; }
 
-  // Reader: the newest value, or null if there is none since the last call. It stays untouched until the next call.
+  // Reader: the newest value, or null if there is none since the last call. It stays untouched until the next
+  // call.
   const T* Take() noexcept {
     if ((shared_.load(std::memory_order_relaxed) & kNew) == 0) return nullptr;
     read_ = shared_.exchange(read_, std::memory_order_acq_rel) & ~kNew;

@@ -20,8 +20,8 @@ struct Wakeup {
   int64_t missed;      // periods that went by unused since the last wake-up
 };
 
-// Real-time safe. Ticks are due at start + k * period: one late tick does not shift the others, and ticks that were missed
-// altogether are skipped, not caught up with.
+// Real-time safe. Ticks are due at start + k * period: one late tick does not shift the others, and ticks
+// that were missed altogether are skipped, not caught up with.
 class PeriodicTimer {
  public:
   explicit PeriodicTimer(int64_t period_us) noexcept;

@@ -3,7 +3,8 @@
 
 namespace intabs {
 
-// From now on the two signals end the process only by way of the flag. System calls they interrupt return EINTR.
+// From now on the two signals end the process only by way of the flag. System calls they interrupt return
+// EINTR.
 void InstallStopSignals() noexcept;
 
 // Real-time safe.

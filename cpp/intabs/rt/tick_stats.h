@@ -6,8 +6,8 @@
 
 namespace intabs {
 
-// Histogram of durations from 0 to 67 s. Percentiles are the upper edge of a bin: never too low, at most 3.2 % (or .1 us)
-// too high; the maximum is exact. Real-time safe.
+// Histogram of durations from 0 to 67 s. Percentiles are the upper edge of a bin: never too low, at most 3.2
+// % (or .1 us) too high; the maximum is exact. Real-time safe.
 class TickStats {
  public:
   void Add(double us) noexcept;

@@ -1,5 +1,5 @@
-// The arm in the plant: command filter and MuJoCo world, ticked together. The same object is inside intabs_plant and in
-// in-process rollouts, so both give the same trajectory for the same commands.
+// The arm in the plant: command filter and MuJoCo world, ticked together. The same object is inside
+// intabs_plant and in in-process rollouts, so both give the same trajectory for the same commands.
 #pragma once
 
 #include <cstdint>
@@ -11,20 +11,23 @@
 
 namespace intabs {
 
-// Deterministic: a reset and the commands with the ticks they come at decide everything. One thread.
-// Time is simulation time from 0; where a wall clock rules, pass its time as `now_us` instead, always or never between two
-// resets.
+// Deterministic: a reset and the commands with the ticks they come at decide everything. One thread. Time is
+// simulation time from 0; where a wall clock rules, pass its time as `now_us` instead, always or never
+// between two resets.
 class ArmSim {
  public:
   // Throws on an unknown task or a broken model.
   ArmSim(const std::string& models_dir, const std::string& task);
 
-  // Starts over: the task's objects displaced by `seed` and `spread_cm`, the arm idle in its home pose, time 0.
+  // Starts over: the task's objects displaced by `seed` and `spread_cm`, the arm idle in its home pose, time
+  // 0.
   void Reset(int64_t seed, double spread_cm) { Reset(seed, spread_cm, 0); }
   void Reset(int64_t seed, double spread_cm, int64_t now_us);
 
   Refusal Accept(const ArmCommand& command) noexcept { return Accept(command, world_.time_us()); }
-  Refusal Accept(const ArmCommand& command, int64_t now_us) noexcept { return controller_.Accept(command, now_us); }
+  Refusal Accept(const ArmCommand& command, int64_t now_us) noexcept {
+    return controller_.Accept(command, now_us);
+  }
 
   // One driver tick of 4 ms: the filter's step, then the world's. Watchdogs see the time at its end.
   void Tick() { Tick(world_.time_us() + kDriverPeriodUs); }

@@ -17,6 +17,7 @@ Status AssembleState(const ArmModel& arm, const Observation& o, StateVector& s) 
     f.head<3>() = X_GO.p.cast<float>();
     f.segment<6>(3) = To6D(X_GO.q).cast<float>();
     f[9] = object.valid ? 1.f : 0.f;
+    f.tail<3>() = (X_GO.p.array() / (kNear + X_GO.p.array().abs())).cast<float>();
   }
   return Status::kOk;
 }

@@ -25,6 +25,9 @@ def register(app: typer.Typer) -> None:
         disturb: Annotated[
             float, typer.Option(help="Size of the disturbances that the demonstrator corrects; 0: none.", min=0)
         ] = 1.0,
+        detours: Annotated[
+            float, typer.Option(help="Probability of each change of mind on the way; 0: none.", min=0, max=1)
+        ] = 0.3,
         jobs: Annotated[int, typer.Option(help="Runs at a time.", min=1)] = 1,
         json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
     ) -> None:
@@ -34,7 +37,7 @@ def register(app: typer.Typer) -> None:
 
         total = demos * (len(DEMONSTRATORS) if task == "all" else 1)
         with Progress("collect", total=total) as progress:
-            figures = run(task, demos, out, perception.value, seed, spread, disturb, jobs, progress.update)
+            figures = run(task, demos, out, perception.value, seed, spread, disturb, detours, jobs, progress.update)
         write_json(json, figures)
         print(f"{out}: {figures['demos']} demonstrations, {figures['frames']} frames")
         for name, t in figures["tasks"].items():

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -11,15 +11,37 @@ from intabs.data.demos import OBJECT_SLOTS, Demo
 
 
 @dataclass
-class Trajectory:
-    """One demonstration as arrays of float32; T - 1 ticks, each with its action."""
+class Readings:
+    """What the robot and perception said, tick by tick: the input of the state features."""
 
-    state: np.ndarray  # (T-1, 47) s = [s^r, s^e], not normalised
+    joint_pos: np.ndarray  # (T, 6)
+    gripper_closed: np.ndarray  # (T,) bool
+    object_pose: np.ndarray  # (T, 4, 7)
+    object_known: np.ndarray  # (T, 4) bool: seen at least once so far
+    object_valid: np.ndarray  # (T, 4) bool
+
+    def state(self, arm) -> np.ndarray:
+        """(T, 59) float32, not normalised."""
+        return _core.assemble_states(
+            arm, self.joint_pos, self.gripper_closed, self.object_pose, self.object_known, self.object_valid
+        )
+
+    def map(self, f) -> Readings:
+        return Readings(*(f(getattr(self, field.name)) for field in fields(self)))
+
+
+@dataclass
+class Trajectory:
+    """One demonstration as arrays; T - 1 ticks, each with its action."""
+
+    readings: Readings
+    state: np.ndarray  # (T-1, 59) s = [s^r, s^e]
     agent_action: np.ndarray  # (T-1, 7) a^r
     environment_action: np.ndarray  # (T-1, 24) a^e
 
 
 def trajectory(demo: Demo, arm) -> Trajectory:
+    """Not normalised."""
     known = np.maximum.accumulate(demo.object_valid, axis=0)
     pose, valid = demo.object_pose, demo.object_valid
     missing = OBJECT_SLOTS - pose.shape[1]
@@ -27,9 +49,10 @@ def trajectory(demo: Demo, arm) -> Trajectory:
         pose = np.pad(pose, ((0, 0), (0, missing), (0, 0)))
         valid = np.pad(valid, ((0, 0), (0, missing)))
         known = np.pad(known, ((0, 0), (0, missing)))
-    state = _core.assemble_states(arm, demo.joint_pos, demo.gripper > 0.5, pose, known, valid)
-    motion = _core.object_motions(arm, demo.joint_pos, pose, known)
-    return Trajectory(state[:-1], demo.actions[:-1].astype("f4"), motion)
+    readings = Readings(demo.joint_pos, demo.gripper > 0.5, pose, known, valid)
+    motion = _core.object_motions(arm, readings.joint_pos, pose, known)
+    readings = readings.map(lambda x: x[:-1])
+    return Trajectory(readings, readings.state(arm), demo.actions[:-1].astype("f4"), motion)
 
 
 @dataclass
@@ -59,10 +82,13 @@ class Normalizer:
             ).astype("f4"),
         )
 
+    def normalize_state(self, state: np.ndarray) -> np.ndarray:
+        return _core.normalize(state, self.state_mean, self.state_scale, self.limit)
+
     def normalize(self, t: Trajectory) -> Trajectory:
-        state = _core.normalize(t.state, self.state_mean, self.state_scale, self.limit)
         return Trajectory(
-            state,
+            t.readings,
+            self.normalize_state(t.state),
             t.agent_action / self.agent_action_scale,
             np.clip(t.environment_action / self.environment_action_scale, -8, 8).astype("f4"),
         )

@@ -35,6 +35,7 @@ class Job:
     spread: float  # cm
     perception: str
     disturb: float  # scale of the disturbances the demonstrator has to correct
+    detours: float  # probability of each change of mind
 
 
 def _array(poses) -> tuple[np.ndarray, np.ndarray]:
@@ -49,7 +50,7 @@ class _Recorder:
     def __init__(self, job: Job, link: bus.Bus):
         rng = np.random.default_rng([job.seed, 7])
         arm = _core.ArmModel.lite6()
-        self.demonstrator = DEMONSTRATORS[job.task](arm, _core.IkSolver(arm), rng, job.disturb)
+        self.demonstrator = DEMONSTRATORS[job.task](arm, _core.IkSolver(arm), rng, job.disturb, job.detours)
         self.link = link
         self.session = random.SystemRandom().getrandbits(62) + 1
         self.seq = 0
@@ -161,6 +162,7 @@ def _demo(job: Job, r: _Recorder) -> Demo:
             "spread_cm": job.spread,
             "perception": job.perception,
             "disturb": job.disturb,
+            "detours": job.detours,
             "success": r.success,
             "rate_hz": 1e6 / POLICY_PERIOD_US,
             "embodiment": "lite6",
@@ -177,10 +179,12 @@ def collect(
     seed: int = 0,
     spread: float = 2.0,
     disturb: float = 1.0,
+    detours: float = 0.3,
     jobs: int = 1,
     progress: Callable[[int, str], None] = lambda done, text: None,
 ) -> dict:
-    """Records until `demos` of every task succeeded. Failed tries are counted and left out."""
+    """Records until `demos` of every task succeeded. Failed tries are counted and left out. Every fifth demonstration is
+    straight: no disturbance, no change of mind; plans are made from those."""
     tasks = list(DEMONSTRATORS) if task == "all" else [task]
     unknown = [t for t in tasks if t not in DEMONSTRATORS]
     if unknown:
@@ -193,7 +197,10 @@ def collect(
         for name in tasks:
             good: list[Demo] = []
             tried = 0
-            queue = (Job(name, seed + i, spread, perception, disturb) for i in range(2 * demos + 2))
+            queue = (
+                Job(name, seed + i, spread, perception, disturb * (i % 5 > 0), detours * (i % 5 > 0))
+                for i in range(2 * demos + 2)
+            )
             for demo in pool.imap(record, queue):
                 tried += 1
                 if demo.attrs["success"]:

@@ -1,7 +1,9 @@
 """A scripted demonstrator: the stand-in for the person who shows the task.
 
 It sees what perception sees (OBJECT_POSES, LITE6_STATUS) and answers with joint targets, 25 Hz. Like a person it varies
-speed, way-points and grasp, pauses, is disturbed and corrects. Nothing of it is in the learned policy's path.
+speed, way-points and grasp, pauses, is disturbed and corrects, and changes its mind: it may look at the goal first, rise
+again before grasping, put the block back, or lift it off the goal once more. Without the last, the state alone would tell
+what comes next, and skills would have nothing to say. Nothing of it is in the learned policy's path.
 """
 
 from __future__ import annotations
@@ -59,9 +61,10 @@ class PickPlace:
 
     needs = (BLOCK, GOAL)  # slots that must be valid before it starts
 
-    def __init__(self, arm, ik, rng: np.random.Generator, disturb: float = 1.0):
+    def __init__(self, arm, ik, rng: np.random.Generator, disturb: float = 1.0, detours: float = 0.0):
+        """disturb scales the disturbances, detours is the probability of each change of mind."""
         self.arm, self.ik, self.rng = arm, ik, rng
-        self.disturb = disturb
+        self.disturb, self.detours = disturb, detours
         self.tempo = rng.uniform(0.85, 1.2)
         self.legs: list[_Leg] | None = None
         self.leg = 0
@@ -90,6 +93,21 @@ class PickPlace:
         p, R = self.held_at
         return p + [0, 0, self.lift], R
 
+    def _put_back(self):
+        return self.held_at
+
+    def _above_goal(self):
+        p, R = self._place_empty()
+        return p + [0, 0, self.hover], R
+
+    def _place_empty(self):
+        p_goal, R_goal = _as_pose(self.objects[GOAL])
+        return p_goal + [0, 0, BLOCK_HALF + GRASP_HEIGHT], self._down(R_goal)
+
+    def _retreat(self, height: float):
+        p, R = self.reference
+        return p + [0, 0, height], R
+
     def _place(self, height: float):
         """Where the tip must be for the block, as it lies in the gripper now, to stand on the goal."""
         p_goal, R_goal = _as_pose(self.objects[GOAL])
@@ -113,17 +131,47 @@ class PickPlace:
         retreat = rng.uniform(0.05, 0.08)
         arch = np.append(rng.normal(0, 0.008, 2), rng.uniform(0, 0.015))
         t = self.tempo
-        self.legs = [
-            _Leg("reach", 1.5 * t, False, 0.006, 0.006, lambda d: d._above_block(), arch * 0.5),
-            _Leg("descend", 0.9 * t, False, 0.0012, 0.003, lambda d: d._grasp()),
-            _Leg("grasp", 0.36, True, 0.01, 0.0, lambda d: d.reference),
-            _Leg("lift", 0.8 * t, True, 0.008, 0.004, lambda d: d._lifted()),
-            _Leg("carry", 1.5 * t, True, 0.006, 0.006, lambda d: d._place(carry_height), arch),
-            _Leg("lower", 1.0 * t, True, 0.002, 0.003, lambda d: d._place(0.001)),
-            _Leg("release", 0.32, False, 0.01, 0.0, lambda d: d.reference),
-            _Leg("retreat", 0.9 * t, False, 0.008, 0.003, lambda d: (d.reference[0] + [0, 0, retreat], d.reference[1])),
-            _Leg("rest", 0.4, False, 0.01, 0.0, lambda d: d.reference),
-        ]
+        slow, fine = 0.006, 0.003  # m, disturbances while moving freely, and close to things
+
+        def legs(*names: str) -> list[_Leg]:
+            return [
+                {
+                    "reach": lambda: _Leg("reach", 1.5 * t, False, 0.006, slow, lambda d: d._above_block(), arch * 0.5),
+                    "look": lambda: _Leg("look", 1.5 * t, False, 0.008, slow, lambda d: d._above_goal(), arch * 0.5),
+                    "descend": lambda: _Leg("descend", 0.9 * t, False, 0.0012, fine, lambda d: d._grasp()),
+                    "rise": lambda: _Leg("rise", 0.7 * t, False, 0.006, fine, lambda d: d._above_block()),
+                    "grasp": lambda: _Leg("grasp", 0.36, True, 0.01, 0.0, lambda d: d.reference),
+                    "lift": lambda: _Leg("lift", 0.8 * t, True, 0.008, 0.004, lambda d: d._lifted()),
+                    "return": lambda: _Leg("return", 0.9 * t, True, 0.002, fine, lambda d: d._put_back()),
+                    "carry": lambda: _Leg("carry", 1.5 * t, True, 0.006, slow, lambda d: d._place(carry_height), arch),
+                    "lower": lambda: _Leg("lower", 1.0 * t, True, 0.002, fine, lambda d: d._place(0.001)),
+                    "release": lambda: _Leg("release", 0.32, False, 0.01, 0.0, lambda d: d.reference),
+                    "retreat": lambda: _Leg("retreat", 0.9 * t, False, 0.008, fine, lambda d: d._retreat(retreat)),
+                    "rest": lambda: _Leg("rest", 0.4, False, 0.01, 0.0, lambda d: d.reference),
+                }[name]()
+                for name in names
+            ]
+
+        def fancy() -> bool:
+            return rng.random() < self.detours
+
+        self.legs = []
+        if fancy():
+            self.legs += legs("look")
+        self.legs += legs("reach")
+        if fancy():
+            self.legs += legs("descend", "rise")
+        if fancy():
+            self.legs += legs("descend", "grasp", "lift", "return", "release", "rise")
+        self.legs += legs("descend", "grasp", "lift")
+        if fancy():
+            self.legs += legs("return", "lift")
+        self.legs += legs("carry")
+        if fancy():
+            self.legs += legs("lower", "carry")
+        if fancy():
+            self.legs += legs("lower", "release", "retreat", "reach", "descend", "grasp", "lift", "carry")
+        self.legs += legs("lower", "release", "retreat", "rest")
         p, R = _as_pose(self.arm.tip(q))
         self.reference = (p, R)
         self.q_target = np.array(q)
@@ -156,11 +204,11 @@ class PickPlace:
             self._start(q, objects)
         leg = self.legs[self.leg]
         # The eyes stay on the objects: before the grasp on the block, afterwards on how it lies in the gripper.
-        if leg.name in ("reach",) and valid[BLOCK]:
+        if leg.name == "reach" and valid[BLOCK]:
             self.objects[BLOCK] = objects[BLOCK]
             self.leg_to = leg.goal(self)
             self.leg_slerp = Slerp([0, 1], Rotation.concatenate([self.leg_from[1], self.leg_to[1]]))
-        if leg.name in ("grasp", "lift") and valid[BLOCK]:
+        if leg.name in ("grasp", "lift", "return") and valid[BLOCK]:
             p_G, R_G = _as_pose(self.arm.tip(q))
             p_O, R_O = _as_pose(objects[BLOCK])
             self.block_in_tip = (R_G.inv().apply(p_O - p_G), R_G.inv() * R_O)

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 LATENT = 8  # of each of z^r, z^e
 AGENT_DIM = 7  # joints, gripper
 OBJECTS = 4
-OBJECT_DIM = 10  # p_GO, two columns of R_GO, valid
+OBJECT_DIM = 13  # p_GO, two columns of R_GO, valid, p_GO compressed: cpp/intabs/skills/state.h
 ENVIRONMENT_DIM = OBJECTS * OBJECT_DIM
 STATE_DIM = AGENT_DIM + ENVIRONMENT_DIM
 AGENT_ACTION_DIM = 7  # joint steps, gripper
@@ -114,7 +114,7 @@ class InteractionAbstractions(nn.Module):
         return mean, log_std
 
     def act(self, state: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        """state (B, T, 47), z (B, 16) held over the segment -> a^r (B, T, 7), a^e (B, T, 24); hidden state from zero."""
+        """state (B, T, 59), z (B, 16) held over the segment -> a^r (B, T, 7), a^e (B, T, 24); hidden state from zero."""
         y = self.pi(torch.cat([state, z[:, None].expand(-1, state.shape[1], -1)], -1))
         return y["agent"], y["environment"]
 

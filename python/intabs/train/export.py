@@ -42,12 +42,14 @@ def encode_demo(model: InteractionAbstractions, normalizer, demo: Demo, cut: int
 
 
 def typical_demo(demos: list[Demo]) -> int:
-    """The demonstration whose objects start nearest to the average place, among those of about average length."""
+    """The demonstration whose objects start nearest to the average place, among straight ones of average length."""
     first = np.array([d.object_pose[np.argmax(d.object_valid.all(1)), :, :3].ravel() for d in demos])
     lengths = np.array([len(d) for d in demos])
-    near_length = np.abs(lengths - np.median(lengths)) <= 0.15 * np.median(lengths)
+    calm = np.array([d.attrs.get("disturb", 0.0) == 0 and d.attrs.get("detours", 0.0) == 0 for d in demos])
+    usual = np.median(lengths[calm]) if calm.any() else np.median(lengths)
+    near_length = np.abs(lengths - usual) <= 0.15 * usual
     distance = np.linalg.norm(first - first.mean(0), axis=1)
-    return int(np.argmin(np.where(near_length, distance, np.inf)))
+    return int(np.argmin(distance + 10.0 * ~near_length + 100.0 * ~calm))
 
 
 def make_plan(model, normalizer, demo: Demo, cut: int, source: str) -> dict:
@@ -92,7 +94,7 @@ def export(run: Path | str, out: Path | str) -> dict:
         "schema_version": SCHEMA,
         "sha256": sha256,
         "networks": {net: module.spec for net, module in model.networks().items()},
-        "state_layout": "gripper-relative/1",  # skills/state.h
+        "state_layout": _core.STATE_LAYOUT,
         "normalizer": normalizer.to_dict(),
         "policy_period_us": 40000,
         "training": {

@@ -9,6 +9,7 @@ import os
 import time
 from pathlib import Path
 
+import numpy as np
 import torch
 import yaml
 
@@ -18,7 +19,7 @@ from intabs.data.demos import load_demos
 from intabs.data.features import Normalizer, trajectory
 from intabs.model.networks import InteractionAbstractions
 from intabs.train.objective import action_error, kl_to_standard_normal
-from intabs.train.segments import SegmentSampler, perturb
+from intabs.train.segments import Segments, SegmentSampler
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 CHECKPOINT_EVERY = 500
@@ -65,15 +66,18 @@ class Trainer:
         valid = [trajectory(d, arm) for d in valid_demos]
         self.normalizer = Normalizer.fit(train)
         length = tuple(config["objective"]["segment"])
-        self.sampler = SegmentSampler([self.normalizer.normalize(t) for t in train], length, device)
-        self.valid = (
-            SegmentSampler([self.normalizer.normalize(t) for t in valid], length, device) if valid else None
-        )
+
+        def sampler(trajectories):
+            normalized = [self.normalizer.normalize(t) for t in trajectories]
+            return SegmentSampler(normalized, self.normalizer, arm, length, config["noise"], device)
+
+        self.sampler = sampler(train)
+        self.valid = sampler(valid) if valid else None
         self.model = InteractionAbstractions(config["model"]).to(device)
         t = config["train"]
         self.optimizer = torch.optim.AdamW(self.model.parameters(), lr=t["lr"], weight_decay=t["weight_decay"])
         self.scheduler = torch.optim.lr_scheduler.LambdaLR(self.optimizer, self._rate)
-        self.generator = torch.Generator().manual_seed(seed)
+        self.rng = np.random.default_rng(seed)
         self.step = 0
         self.seconds = 0.0
 
@@ -85,18 +89,17 @@ class Trainer:
         x = (step - t["warmup"]) / max(1, t["steps"] - t["warmup"])
         return 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * min(x, 1.0)))
 
-    def _loss(self, batch, noise: bool, generator: torch.Generator) -> tuple[torch.Tensor, dict]:
-        state, agent_action, environment_action = batch
-        mean, log_std = self.model.encode(state, agent_action, environment_action)
+    def _loss(self, batch: Segments, rng: np.random.Generator | None) -> tuple[torch.Tensor, dict]:
+        """rng: of z's noise; None takes the mean."""
+        mean, log_std = self.model.encode(batch.state, batch.agent_action, batch.environment_action)
         z = mean
-        seen = state
-        if noise:
-            z = mean + torch.exp(log_std) * torch.randn(mean.shape, generator=generator).to(mean.device)
-            seen = perturb(state, self.normalizer, self.config["noise"], generator)
-        agent, environment = self.model.act(seen, z)
+        if rng is not None:
+            noise = rng.standard_normal(tuple(mean.shape), dtype="f4")
+            z = mean + torch.exp(log_std) * torch.from_numpy(noise).to(mean.device)
+        agent, environment = self.model.act(batch.seen, z)
         terms = {
-            "agent": action_error(agent, agent_action),
-            "environment": action_error(environment, environment_action),
+            "agent": action_error(agent, batch.agent_action),
+            "environment": action_error(environment, batch.environment_action),
             "kl": kl_to_standard_normal(mean, log_std),
         }
         o = self.config["objective"]
@@ -107,18 +110,32 @@ class Trainer:
         """Held-out demonstrations, always the same segments, z at its mean, no noise."""
         if self.valid is None:
             return {}
-        generator = torch.Generator().manual_seed(0)
+        rng = np.random.default_rng(0)
         self.model.eval()
         sums: dict[str, float] = {}
         with torch.no_grad():
             for _ in range(4):
-                _, terms = self._loss(self.valid.sample(256, generator), False, generator)
+                _, terms = self._loss(self.valid.sample(256, rng, noisy=False), None)
                 for k, v in terms.items():
                     sums[k] = sums.get(k, 0.0) + float(v) / 4
         self.model.train()
         return sums
 
-    def train(self, progress=lambda step, total, text: None) -> dict:
+    def one_step(self) -> tuple[torch.Tensor, dict]:
+        """One batch, one update."""
+        batch = self.sampler.sample(self.config["train"]["batch"], self.rng)
+        loss, terms = self._loss(batch, self.rng)
+        if not torch.isfinite(loss):
+            raise UserError(f"loss is not finite at step {self.step}; lower train.lr or look at the data")
+        self.optimizer.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config["train"]["clip"])
+        self.optimizer.step()
+        self.scheduler.step()
+        self.step += 1
+        return loss.detach(), terms
+
+    def train(self, progress=lambda step, text: None) -> dict:
         from torch.utils.tensorboard import SummaryWriter
 
         self.run.mkdir(parents=True, exist_ok=True)
@@ -128,29 +145,20 @@ class Trainer:
         loss_value = float("nan")
         began = time.monotonic() - self.seconds
         while self.step < total:
-            batch = self.sampler.sample(self.config["train"]["batch"], self.generator)
-            loss, terms = self._loss(batch, True, self.generator)
-            if not torch.isfinite(loss):
-                raise UserError(f"loss is not finite at step {self.step}; lower train.lr or look at the data")
-            self.optimizer.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config["train"]["clip"])
-            self.optimizer.step()
-            self.scheduler.step()
-            self.step += 1
+            loss, terms = self.one_step()
             self.seconds = time.monotonic() - began
             if self.step % 50 == 0 or self.step == total:
                 loss_value = loss.item()
                 writer.add_scalar("train/loss", loss_value, self.step)
                 for k, v in terms.items():
                     writer.add_scalar(f"train/{k}", float(v), self.step)
-                progress(self.step, total, f"loss {loss_value:.4f}")
+                progress(self.step, f"loss {loss_value:.4f}")
             if self.step % VALIDATE_EVERY == 0 or self.step == total:
                 valid = self.validate()
                 for k, v in valid.items():
                     writer.add_scalar(f"valid/{k}", v, self.step)
                 text = ", ".join(f"{k} {v:.4f}" for k, v in valid.items())
-                progress(self.step, total, f"loss {loss_value:.4f}; held out: {text}")
+                progress(self.step, f"loss {loss_value:.4f}; held out: {text}")
             if self.step % CHECKPOINT_EVERY == 0 or self.step == total:
                 self.save()
         writer.close()
@@ -177,7 +185,7 @@ class Trainer:
                 "model": self.model.state_dict(),
                 "optimizer": self.optimizer.state_dict(),
                 "scheduler": self.scheduler.state_dict(),
-                "generator": self.generator.get_state(),
+                "rng": json.dumps(self.rng.bit_generator.state),
             },
             partial,
         )
@@ -194,7 +202,7 @@ class Trainer:
         self.model.load_state_dict(c["model"])
         self.optimizer.load_state_dict(c["optimizer"])
         self.scheduler.load_state_dict(c["scheduler"])
-        self.generator.set_state(c["generator"])
+        self.rng.bit_generator.state = json.loads(c["rng"])
         self.step, self.seconds = c["step"], c["seconds"]
 
 

@@ -1,3 +1,5 @@
+#include "intabs/bus/bus.h"
+
 #include <catch2/catch.hpp>
 #include <cstdio>
 #include <memory>
@@ -5,7 +7,6 @@
 #include <vector>
 
 #include "bus/samples.h"
-#include "intabs/bus/bus.h"
 #include "intabs/bus/lcm_bus.h"
 #include "intabs/bus/memory_bus.h"
 #include "intabs_lcm/hand_keypoints_t.hpp"
@@ -189,7 +190,8 @@ TEST_CASE("Garbage and truncated datagrams on every channel raise the counter an
       INFO(channel.name);
       int handled = 0;
       int undecodable = 0;
-      bus.Subscribe(channel, [&](const M&) { ++handled; }, [&] { ++undecodable; });
+      bus.Subscribe(
+          channel, [&](const M&) { ++handled; }, [&] { ++undecodable; });
       const auto good = Bytes(Largest<M>());
       for (int k = 0; k < 20; ++k) {
         std::vector<uint8_t> garbage(1 + random() % 1300);
@@ -255,7 +257,8 @@ TEST_CASE("A prefix separates two arms on one network") {
 }
 
 TEST_CASE("What cannot work is said in one line") {
-  CHECK_THROWS_WITH(LcmBus("udpm://10.0.0.1:7667"), Catch::Contains("10.0.0.1") && Catch::Contains("no multicast"));
+  CHECK_THROWS_WITH(LcmBus("udpm://10.0.0.1:7667"),
+                    Catch::Contains("10.0.0.1") && Catch::Contains("no multicast"));
   CHECK_THROWS_WITH(LcmBus("nonsense://"), Catch::Contains("nonsense"));
   CHECK_THROWS_WITH(MemoryBus("A.*"), Catch::Contains("A.*"));
 }

@@ -12,7 +12,9 @@ struct Counter {
   double n = 0;
   double operator()() { return n += 1.25; }
   int64_t Int() { return (int64_t{1} << 40) + static_cast<int64_t>(n += 1); }
-  JointVector Joints() { return JointVector::NullaryExpr([this] { return (*this)(); }); }
+  JointVector Joints() {
+    return JointVector::NullaryExpr([this] { return (*this)(); });
+  }
   // Quarter turns have coefficients that float32 holds exactly.
   Pose ExactPose() {
     Pose X;
@@ -87,12 +89,12 @@ inline ArmStatus Largest() {
   return m;
 }
 inline bool Same(const ArmStatus& a, const ArmStatus& b) {
-  return a.utime == b.utime && a.seq == b.seq && a.source == b.source && a.session == b.session && a.q == b.q &&
-         a.dq == b.dq && a.q_commanded == b.q_commanded && a.tau == b.tau && a.gripper_closed == b.gripper_closed &&
-         a.gripper_opening == b.gripper_opening && a.mode == b.mode && a.state == b.state && a.fault == b.fault &&
-         a.vendor_error == b.vendor_error && a.last_command_seq == b.last_command_seq &&
-         a.last_frame_seq == b.last_frame_seq && a.refused == b.refused && a.overruns == b.overruns &&
-         a.tick_us == b.tick_us;
+  return a.utime == b.utime && a.seq == b.seq && a.source == b.source && a.session == b.session &&
+         a.q == b.q && a.dq == b.dq && a.q_commanded == b.q_commanded && a.tau == b.tau &&
+         a.gripper_closed == b.gripper_closed && a.gripper_opening == b.gripper_opening && a.mode == b.mode &&
+         a.state == b.state && a.fault == b.fault && a.vendor_error == b.vendor_error &&
+         a.last_command_seq == b.last_command_seq && a.last_frame_seq == b.last_frame_seq &&
+         a.refused == b.refused && a.overruns == b.overruns && a.tick_us == b.tick_us;
 }
 
 inline bool Same(const Pose& a, const Pose& b) { return a.p == b.p && a.q.coeffs() == b.q.coeffs(); }
@@ -107,11 +109,12 @@ inline ObjectPoses Largest() {
   return m;
 }
 inline bool Same(const ObjectPoses& a, const ObjectPoses& b) {
-  bool same = a.utime == b.utime && a.seq == b.seq && a.exposure_utime == b.exposure_utime && a.frame_seq == b.frame_seq;
+  bool same = a.utime == b.utime && a.seq == b.seq && a.exposure_utime == b.exposure_utime &&
+              a.frame_seq == b.frame_seq;
   for (int i = 0; i < kMaxObjects; ++i) {
     const auto &x = a.objects[i], &y = b.objects[i];
-    same = same && x.id == y.id && Same(x.X_WO, y.X_WO) && x.covariance == y.covariance && x.cameras == y.cameras &&
-           x.valid == y.valid && x.age == y.age;
+    same = same && x.id == y.id && Same(x.X_WO, y.X_WO) && x.covariance == y.covariance &&
+           x.cameras == y.cameras && x.valid == y.valid && x.age == y.age;
   }
   return same;
 }
@@ -128,8 +131,8 @@ inline PlantTruth Largest() {
   return m;
 }
 inline bool Same(const PlantTruth& a, const PlantTruth& b) {
-  bool same = a.utime == b.utime && a.seq == b.seq && a.frame_seq == b.frame_seq && a.subgoals == b.subgoals &&
-              a.success == b.success && a.state_hash == b.state_hash;
+  bool same = a.utime == b.utime && a.seq == b.seq && a.frame_seq == b.frame_seq &&
+              a.subgoals == b.subgoals && a.success == b.success && a.state_hash == b.state_hash;
   for (int i = 0; i < kMaxObjects; ++i) {
     same = same && a.objects[i].id == b.objects[i].id && Same(a.objects[i].X_WO, b.objects[i].X_WO) &&
            b.objects[i].valid;
@@ -160,8 +163,8 @@ inline bool Same(const TagDetections& a, const TagDetections& b) {
   for (int i = 0; i < a.n; ++i) {
     const auto &x = a.tags[i], &y = b.tags[i];
     same = same && x.id == y.id && x.corners == y.corners && Same(x.X_CT[0], y.X_CT[0]) &&
-           Same(x.X_CT[1], y.X_CT[1]) && x.reprojection_px == y.reprojection_px && x.ambiguity == y.ambiguity &&
-           x.decision_margin == y.decision_margin;
+           Same(x.X_CT[1], y.X_CT[1]) && x.reprojection_px == y.reprojection_px &&
+           x.ambiguity == y.ambiguity && x.decision_margin == y.decision_margin;
   }
   return same;
 }
@@ -227,9 +230,9 @@ inline LoopStatus Largest() {
   return m;
 }
 inline bool Same(const LoopStatus& a, const LoopStatus& b) {
-  return a.utime == b.utime && a.seq == b.seq && a.name == b.name && a.ticks == b.ticks && a.overruns == b.overruns &&
-         a.rate_hz == b.rate_hz && a.wakeup_us == b.wakeup_us && a.tick_us == b.tick_us && a.infer_us == b.infer_us &&
-         a.allocations == b.allocations;
+  return a.utime == b.utime && a.seq == b.seq && a.name == b.name && a.ticks == b.ticks &&
+         a.overruns == b.overruns && a.rate_hz == b.rate_hz && a.wakeup_us == b.wakeup_us &&
+         a.tick_us == b.tick_us && a.infer_us == b.infer_us && a.allocations == b.allocations;
 }
 
 template <>
@@ -248,8 +251,8 @@ inline PerceptionStatus Largest() {
   return m;
 }
 inline bool Same(const PerceptionStatus& a, const PerceptionStatus& b) {
-  return a.utime == b.utime && a.seq == b.seq && a.n == b.n && a.frames == b.frames && a.dropped == b.dropped &&
-         a.late == b.late && a.fps == b.fps && a.detect_us_p50 == b.detect_us_p50 &&
+  return a.utime == b.utime && a.seq == b.seq && a.n == b.n && a.frames == b.frames &&
+         a.dropped == b.dropped && a.late == b.late && a.fps == b.fps && a.detect_us_p50 == b.detect_us_p50 &&
          a.detect_us_p95 == b.detect_us_p95;
 }
 
@@ -264,8 +267,8 @@ inline PlantControl Largest() {
   return m;
 }
 inline bool Same(const PlantControl& a, const PlantControl& b) {
-  return a.utime == b.utime && a.seq == b.seq && a.task == b.task && a.seed == b.seed && a.spread == b.spread &&
-         a.reset == b.reset;
+  return a.utime == b.utime && a.seq == b.seq && a.task == b.task && a.seed == b.seed &&
+         a.spread == b.spread && a.reset == b.reset;
 }
 
 template <>

@@ -23,7 +23,8 @@ thread_local int64_t allocations = 0;
 }  // namespace
 
 #ifndef INTABS_SANITIZED
-// glibc's allocator under its other names. operator new of libstdc++ calls malloc or aligned_alloc, so it is counted.
+// glibc's allocator under its other names. operator new of libstdc++ calls malloc or aligned_alloc, so it is
+// counted.
 extern "C" {
 void* __libc_malloc(size_t);
 void* __libc_calloc(size_t, size_t);
@@ -96,10 +97,12 @@ bool AllocationHookSeesAll() {
   once([] { return std::aligned_alloc(64, 128); }, std::free);
   once([] { return memalign(64, 128); }, std::free);
   once([] { return valloc(128); }, std::free);
-  once([]() -> void* {
-    void* p = nullptr;
-    return posix_memalign(&p, 64, 128) == 0 ? p : nullptr;
-  }, std::free);
+  once(
+      []() -> void* {
+        void* p = nullptr;
+        return posix_memalign(&p, 64, 128) == 0 ? p : nullptr;
+      },
+      std::free);
   once([]() -> void* { return new int; }, [](void* p) { delete static_cast<int*>(p); });
   once([]() -> void* { return new int[7]; }, [](void* p) { delete[] static_cast<int*>(p); });
   once([]() -> void* { return new Wide; }, [](void* p) { delete static_cast<Wide*>(p); });

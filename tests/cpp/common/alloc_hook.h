@@ -1,6 +1,7 @@
 // Shows that code does not allocate: counts this thread's calls of malloc, calloc, realloc, reallocarray,
-// posix_memalign, aligned_alloc, memalign, valloc and every operator new, in any build type, by taking the allocator's
-// place in the executable. In a CMakeLists.txt: intabs_test(tick SOURCES tick_test.cc LIBS intabs::nn intabs_alloc_hook)
+// posix_memalign, aligned_alloc, memalign, valloc and every operator new, in any build type, by taking the
+// allocator's place in the executable. In a CMakeLists.txt: intabs_test(tick SOURCES tick_test.cc LIBS
+// intabs::nn intabs_alloc_hook)
 //
 //   #include "common/alloc_hook.h"
 //   TEST_CASE("The tick does not allocate") {

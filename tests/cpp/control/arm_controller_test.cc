@@ -154,7 +154,9 @@ TEST_CASE("A hold command after a gap ends the way to a fault") {
   CHECK(rig.Status().state == ArmState::kHolding);
 }
 
-TEST_CASE("While a session is in command, another one is refused: tracking, slowing, and holding with a valid command") {
+TEST_CASE(
+    "While a session is in command, another one is refused: tracking, slowing, and holding with a valid "
+    "command") {
   Rig rig;
   REQUIRE(rig.Send(rig.Command(kA, 1, 3.0)) == Refusal::kAccepted);
   rig.Tick(5);
@@ -296,10 +298,12 @@ TEST_CASE("Bad commands are refused by kind, counted, and move nothing") {
       {"NaN", Refusal::kNotFinite, [](ArmCommand& c, double n, double) { c.q_target[3] = n; }},
       {"infinity", Refusal::kNotFinite, [](ArmCommand& c, double, double i) { c.q_target[0] = -i; }},
       {"NaN speed", Refusal::kNotFinite, [](ArmCommand& c, double n, double) { c.dq_max[5] = n; }},
-      {"beyond a joint limit", Refusal::kOutOfRange, [](ArmCommand& c, double, double) { c.q_target[2] = -0.07; }},
+      {"beyond a joint limit", Refusal::kOutOfRange,
+       [](ArmCommand& c, double, double) { c.q_target[2] = -0.07; }},
       {"speed 0", Refusal::kOutOfRange, [](ArmCommand& c, double, double) { c.dq_max[2] = 0; }},
       {"lifetime 0", Refusal::kOutOfRange, [](ArmCommand& c, double, double) { c.lifetime_us = 0; }},
-      {"endless lifetime", Refusal::kOutOfRange, [](ArmCommand& c, double, double) { c.lifetime_us = INT64_MAX; }},
+      {"endless lifetime", Refusal::kOutOfRange,
+       [](ArmCommand& c, double, double) { c.lifetime_us = INT64_MAX; }},
       {"repeated", Refusal::kOldSequence, [](ArmCommand& c, double, double) { c.seq = 10; }},
       {"reordered", Refusal::kOldSequence, [](ArmCommand& c, double, double) { c.seq = 9; }},
   };
@@ -362,7 +366,8 @@ TEST_CASE("Whatever is sent, the reference keeps the limits and stays finite") {
       rig.Tick();
       const JointVector &q = rig.controller.q_ref(), &dq = rig.controller.dq_ref();
       INFO("seed " << seed << " tick " << tick << " q " << q.transpose() << " dq " << dq.transpose());
-      if (!q.allFinite() || (q - limits.q_max).maxCoeff() > 1e-9 || (limits.q_min - q).maxCoeff() > 1e-9) FAIL("position");
+      if (!q.allFinite() || (q - limits.q_max).maxCoeff() > 1e-9 || (limits.q_min - q).maxCoeff() > 1e-9)
+        FAIL("position");
       if (!((dq.cwiseAbs() - limits.dq_max).maxCoeff() <= 1e-9)) FAIL("speed");
       if (!(((dq - v) / 0.004).cwiseAbs().maxCoeff() <= 20 + 1e-9)) FAIL("acceleration");
       tcp_speed = std::max(tcp_speed, (model.Tip(q).p - model.Tip(x).p).norm() / 0.004);

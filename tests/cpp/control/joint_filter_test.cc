@@ -19,7 +19,8 @@ struct Watch {
     beyond_speed = std::max(beyond_speed, (filter.velocity().cwiseAbs() - l.dq_max).maxCoeff());
     beyond_acceleration = std::max(
         beyond_acceleration, ((filter.velocity() - v) / kDt).cwiseAbs().maxCoeff() - l.ddq_max.maxCoeff());
-    inconsistent = std::max(inconsistent, ((filter.position() - x) - filter.velocity() * kDt).cwiseAbs().maxCoeff());
+    inconsistent =
+        std::max(inconsistent, ((filter.position() - x) - filter.velocity() * kDt).cwiseAbs().maxCoeff());
     const double speed = (model.Tip(filter.position()).p - model.Tip(x).p).norm() / kDt;
     tcp_speed = std::max(tcp_speed, speed);
     fast_ticks += speed > 1.01 * l.tcp_speed_max;
@@ -31,13 +32,15 @@ struct Watch {
   const JointFilter& filter;
   ArmModel model = ArmModel::Lite6();
   JointVector x, v;
-  double beyond_position = -1e9, beyond_speed = -1e9, beyond_acceleration = -1e9, inconsistent = 0, tcp_speed = 0;
+  double beyond_position = -1e9, beyond_speed = -1e9, beyond_acceleration = -1e9, inconsistent = 0,
+         tcp_speed = 0;
   int64_t ticks = 0, fast_ticks = 0;
 };
 
 JointVector RandomPose(std::mt19937& random, const ArmLimits& l) {
   std::uniform_real_distribution<double> u(0, 1);
-  return JointVector::NullaryExpr([&](Eigen::Index i) { return l.q_min[i] + u(random) * (l.q_max[i] - l.q_min[i]); });
+  return JointVector::NullaryExpr(
+      [&](Eigen::Index i) { return l.q_min[i] + u(random) * (l.q_max[i] - l.q_min[i]); });
 }
 
 }  // namespace
@@ -102,7 +105,8 @@ TEST_CASE("Random target streams never drive the reference beyond position, spee
     CHECK(watch.beyond_acceleration <= 1e-9);
     CHECK(watch.inconsistent <= 2e-7);  // the last hop onto the target is shorter than 1e-7 rad
     CHECK(watch.tcp_speed <= 0.6);      // the controller's guard
-    // Aimed at 0.5 m/s. Where joints cannot brake at once without breaking the acceleration limit it is a little over.
+    // Aimed at 0.5 m/s. Where joints cannot brake at once without breaking the acceleration limit it is a
+    // little over.
     CHECK(watch.fast_ticks <= watch.ticks / 100);
     CAPTURE(watch.tcp_speed, watch.fast_ticks);
     CHECK(watch.tcp_speed > 0.45);  // the streams do reach it

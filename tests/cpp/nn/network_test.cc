@@ -12,7 +12,11 @@ using namespace intabs;
 
 namespace {
 
-const NetworkSpec kPi{.input = 9, .input_linear = 16, .layers = 3, .hidden = 16, .residual = true,
+const NetworkSpec kPi{.input = 9,
+                      .input_linear = 16,
+                      .layers = 3,
+                      .hidden = 16,
+                      .residual = true,
                       .heads = {{"a_log_std", 4}, {"a_mean", 4}, {"b", 1}, {"e_mean", 2}}};
 
 Eigen::MatrixXf Inputs(int n, int T, unsigned seed) {
@@ -29,7 +33,9 @@ Eigen::VectorXf AllHeads(const Network& net) {
 
 // The LSTM written out once more, straight from torch's documentation, in double and without any of our code.
 std::vector<Eigen::VectorXd> ByTheBook(const WeightsFile& w, const NetworkSpec& s, const Eigen::MatrixXf& X) {
-  const auto M = [&](const std::string& name) -> Eigen::MatrixXd { return w.tensor("net." + name).cast<double>(); };
+  const auto M = [&](const std::string& name) -> Eigen::MatrixXd {
+    return w.tensor("net." + name).cast<double>();
+  };
   const auto sigmoid = [](double v) { return 1 / (1 + std::exp(-v)); };
   std::vector<Eigen::VectorXd> h(s.layers, Eigen::VectorXd::Zero(s.hidden)), c = h, out;
   for (int t = 0; t < X.cols(); ++t) {
@@ -37,7 +43,8 @@ std::vector<Eigen::VectorXd> ByTheBook(const WeightsFile& w, const NetworkSpec& 
     if (s.input_linear > 0) x = (M("input.weight") * x + M("input.bias")).eval();
     for (int l = 0; l < s.layers; ++l) {
       const std::string p = "lstm." + std::to_string(l) + ".";
-      const Eigen::VectorXd g = M(p + "weight_ih") * x + M(p + "bias_ih") + M(p + "weight_hh") * h[l] + M(p + "bias_hh");
+      const Eigen::VectorXd g =
+          M(p + "weight_ih") * x + M(p + "bias_ih") + M(p + "weight_hh") * h[l] + M(p + "bias_hh");
       for (int k = 0; k < s.hidden; ++k) {
         const double i = sigmoid(g[k]), f = sigmoid(g[s.hidden + k]), gg = std::tanh(g[2 * s.hidden + k]),
                      o = sigmoid(g[3 * s.hidden + k]);
@@ -164,7 +171,7 @@ TEST_CASE("Heads know what they mean and refuse what does not fit") {
   CHECK_THROWS_WITH(BernoulliHead(net, "a_mean"), "head \"a_mean\" has size 4, a Bernoulli head has 1");
 }
 
-TEST_CASE("Step, Reset and the state do not allocate") {
+TEST_CASE("Neither Step nor Reset nor the state allocates, in any weight format") {
   if (!AllocationHookActive()) {
     WARN("skipped: a sanitizer owns the allocator");
     return;
@@ -173,20 +180,95 @@ TEST_CASE("Step, Reset and the state do not allocate") {
   NetworkSpec s = kPi;
   s.layers = 8;
   s.hidden = s.input_linear = 128;
-  Network net(MakeRandomWeights(s, 14), "net");
-  const GaussianHead a(net, "a");
+  const WeightsFile w = MakeRandomWeights(s, 14);
   const Eigen::MatrixXf X = Inputs(s.input, 20, 15);
-  std::vector<float> state(net.state_size());
-  float sum = 0;
-  const AllocationCounter counter;
-  for (int t = 0; t < 20; ++t) {
-    if (t == 10) net.Reset();
-    if (net.Step(X.col(t).data()) != Status::kOk) break;
-    net.SaveState(state.data());
-    net.RestoreState(state.data());
-    sum += a.Mean(net).sum();
+  for (const WeightFormat format : {WeightFormat::kFp32, WeightFormat::k16, WeightFormat::k8}) {
+    Network net(w, "net", {.format = format});
+    const GaussianHead a(net, "a");
+    std::vector<float> state(net.state_size());
+    float sum = 0;
+    const AllocationCounter counter;
+    for (int t = 0; t < 20; ++t) {
+      if (t == 10) net.Reset();
+      if (net.Step(X.col(t).data()) != Status::kOk) break;
+      net.SaveState(state.data());
+      net.RestoreState(state.data());
+      sum += a.Mean(net).sum();
+    }
+    const int64_t n = counter.count();
+    CHECK(n == 0);
+    CHECK(sum != 0);
   }
-  const int64_t n = counter.count();
-  CHECK(n == 0);
-  CHECK(sum != 0);
+}
+
+TEST_CASE("Sequence after warm-up and Batch do not allocate, in any weight format") {
+  if (!AllocationHookActive()) {
+    WARN("skipped: a sanitizer owns the allocator");
+    return;
+  }
+  REQUIRE(AllocationHookSeesAll());
+  for (const WeightFormat format : {WeightFormat::kFp32, WeightFormat::k16, WeightFormat::k8}) {
+    for (const bool bidirectional : {false, true}) {
+      NetworkSpec s = kPi;
+      s.bidirectional = bidirectional;
+      s.layer_norm = true;
+      Network net(MakeRandomWeights(s, 16), "net", {.format = format});
+      const RowMatrixXf X = Inputs(300, s.input, 17);
+      std::vector<RowMatrixXf> heads;
+      const auto run = [&](int T) {
+        const AllocationCounter counter;
+        for (const int threads : {1, 2}) {
+          net.Sequence(X.topRows(T), heads, threads);
+          net.EncodeFinal(X.topRows(T), threads);
+        }
+        return counter.count();
+      };
+      CHECK(run(300) > 0);  // the warm-up does, which also shows that the counter counts here
+      CHECK(run(300) == 0);
+      net.EncodeFinal(X.topRows(150));
+      const AllocationCounter counter;
+      net.EncodeFinal(X.topRows(290));
+      const int64_t n = counter.count();
+      CHECK(n == 0);
+    }
+    const Network net(MakeRandomWeights(kPi, 18), "net", {.format = format});
+    NetworkBatch batch(net, 13);
+    const RowMatrixXf X = Inputs(13, kPi.input, 19);
+    std::vector<float> state(net.state_size());
+    Status status = Status::kOk;
+    const AllocationCounter counter;
+    for (int t = 0; t < 10 && status == Status::kOk; ++t) {
+      status = batch.Step(X.data());
+      batch.SaveState(3, state.data());
+      batch.RestoreState(7, state.data());
+    }
+    batch.Reset();
+    const int64_t n = counter.count();
+    CHECK(n == 0);
+    CHECK(status == Status::kOk);
+  }
+}
+
+TEST_CASE("A batch refuses what it cannot run") {
+  NetworkSpec s = kPi;
+  CHECK_THROWS_WITH(NetworkBatch(Network(MakeRandomWeights(s, 1), "net"), 0),
+                    "a batch needs at least one rollout, not 0");
+  NetworkBatch batch(Network(MakeRandomWeights(s, 1), "net"), 2);
+  RowMatrixXf X = RowMatrixXf::Zero(2, s.input);
+  X(1, 3) = std::numeric_limits<float>::quiet_NaN();
+  CHECK(batch.Step(X.data()) == Status::kInvalidInput);
+  s.bidirectional = true;
+  CHECK_THROWS_WITH(NetworkBatch(Network(MakeRandomWeights(s, 1), "net"), 2),
+                    "network \"net\" is bidirectional: it has no tick, and no batch");
+}
+
+TEST_CASE("The manifest chooses the weight format, and the caller may choose another") {
+  NetworkSpec s = kPi;
+  s.format = WeightFormat::k8;
+  s.hidden = 128;
+  const WeightsFile w = MakeRandomWeights(s, 20);
+  const Network eight(w, "net"), full(w, "net", {.format = WeightFormat::kFp32});
+  CHECK(eight.spec().format == WeightFormat::k8);
+  CHECK(full.spec().format == WeightFormat::kFp32);
+  CHECK(eight.weight_bytes() < full.weight_bytes() / 2);
 }

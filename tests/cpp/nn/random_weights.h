@@ -52,6 +52,11 @@ inline RawTensors RandomNetwork(const std::string& net, const NetworkSpec& s, un
       out[prefix + "bias_hh" + end] = RandomTensor({4 * s.hidden}, bound, rng);
     }
   }
+  for (int l = 1; l < s.layers && s.layer_norm; ++l) {
+    const std::string prefix = net + ".lstm." + std::to_string(l) + ".norm.";
+    out[prefix + "weight"] = RandomTensor({s.layer_input(l)}, 2, rng);
+    out[prefix + "bias"] = RandomTensor({s.layer_input(l)}, 1, rng);
+  }
   for (const HeadSpec& h : s.heads) {
     out[net + ".heads." + h.name + ".weight"] = RandomTensor({h.size, s.layer_output()}, bound, rng);
     out[net + ".heads." + h.name + ".bias"] = RandomTensor({h.size}, bound, rng);
@@ -91,7 +96,12 @@ inline std::string ManifestText(const std::map<std::string, NetworkSpec>& networ
     out += std::string(first ? "" : ",") + "\"" + name + "\":{\"input\":" + std::to_string(s.input) +
            ",\"input_linear\":" + std::to_string(s.input_linear) + ",\"layers\":" + std::to_string(s.layers) +
            ",\"hidden\":" + std::to_string(s.hidden) + ",\"residual\":" + (s.residual ? "true" : "false") +
-           ",\"bidirectional\":" + (s.bidirectional ? "true" : "false") + ",\"heads\":{";
+           ",\"bidirectional\":" + (s.bidirectional ? "true" : "false") +
+           ",\"layer_norm\":" + (s.layer_norm ? "true" : "false") + ",\"format\":\"" +
+           (s.format == WeightFormat::kFp32 ? "fp32"
+            : s.format == WeightFormat::k16 ? "16"
+                                            : "8") +
+           "\",\"heads\":{";
     for (size_t i = 0; i < s.heads.size(); ++i) {
       if (i > 0) out += ",";
       out += "\"" + s.heads[i].name + "\":" + std::to_string(s.heads[i].size);
@@ -102,11 +112,12 @@ inline std::string ManifestText(const std::map<std::string, NetworkSpec>& networ
   return out + "}}";
 }
 
-inline WeightsFile MakeWeights(const std::map<std::string, NetworkSpec>& networks, const RawTensors& tensors) {
+inline WeightsFile MakeWeights(const std::map<std::string, NetworkSpec>& networks,
+                               const RawTensors& tensors) {
   std::vector<uint8_t> image = SafeTensorsImage(tensors);
   const std::string sha = Sha256Hex(image.data(), image.size());
-  return WeightsFile::Parse(std::move(image), Manifest::Parse(ManifestText(networks, sha), "weights/t/manifest.json"),
-                            "weights/t");
+  return WeightsFile::Parse(
+      std::move(image), Manifest::Parse(ManifestText(networks, sha), "weights/t/manifest.json"), "weights/t");
 }
 
 inline WeightsFile MakeRandomWeights(const NetworkSpec& spec, unsigned seed, float gain = 1) {

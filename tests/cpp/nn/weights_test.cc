@@ -9,12 +9,17 @@
 
 #include "intabs/nn/network.h"
 #include "nn/random_weights.h"
+#include "nn/weights_fuzz.h"
 
 using namespace intabs;
 
 namespace {
 
-const NetworkSpec kSpec{.input = 5, .input_linear = 6, .layers = 2, .hidden = 8, .residual = true,
+const NetworkSpec kSpec{.input = 5,
+                        .input_linear = 6,
+                        .layers = 2,
+                        .hidden = 8,
+                        .residual = true,
                         .heads = {{"a_mean", 3}, {"b", 1}}};
 
 // The error's text; it must be one line.
@@ -49,7 +54,9 @@ void SetFloat(RawTensor& t, size_t i, float v) { std::memcpy(t.bytes.data() + 4 
 }  // namespace
 
 TEST_CASE("SHA-256 gives the digests of FIPS 180-4") {
-  const auto hex = [](const std::string& s) { return Sha256Hex(reinterpret_cast<const uint8_t*>(s.data()), s.size()); };
+  const auto hex = [](const std::string& s) {
+    return Sha256Hex(reinterpret_cast<const uint8_t*>(s.data()), s.size());
+  };
   CHECK(hex("") == "e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855");
   CHECK(hex("abc") == "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad");
   CHECK(hex("abcdbcdecdefdefgefghfghighijhijkijkljklmklmnlmnomnopnopq") ==
@@ -86,7 +93,8 @@ TEST_CASE("16-bit and 8-bit tensors become the floats they stand for") {
   CHECK(i8(0, 5) == 63.5f);
 
   t.erase("pi.heads.b.weight.scale");
-  CHECK(LoadError(t) == "weights/t: tensor \"pi.heads.b.weight\" is I8 and needs tensor \"pi.heads.b.weight.scale\"");
+  CHECK(LoadError(t) ==
+        "weights/t: tensor \"pi.heads.b.weight\" is I8 and needs tensor \"pi.heads.b.weight.scale\"");
 }
 
 TEST_CASE("Each fault of a tensor is one line that names tensor, found and expected") {
@@ -101,11 +109,14 @@ TEST_CASE("Each fault of a tensor is one line that names tensor, found and expec
   t = Good();
   std::mt19937 rng;
   t["pi.extra"] = RandomTensor({2, 3}, 1, rng);
-  CHECK(LoadError(t) == "weights/t: tensor \"pi.extra\" (2x3) is in the file, but no network of the manifest wants it");
+  CHECK(LoadError(t) ==
+        "weights/t: tensor \"pi.extra\" (2x3) is in the file, but no network of the manifest wants it");
 
   t = Good();
   t["pi.input.bias"].dtype = "F64";
-  CHECK(LoadError(t) == "weights/t/weights.safetensors: tensor \"pi.input.bias\" has dtype \"F64\", wanted F32, F16, BF16 or I8");
+  CHECK(LoadError(t) ==
+        "weights/t/weights.safetensors: tensor \"pi.input.bias\" has dtype \"F64\", wanted F32, F16, BF16 or "
+        "I8");
 
   for (const float bad : {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity()}) {
     t = Good();
@@ -135,7 +146,9 @@ TEST_CASE("A file cut anywhere is refused with one line") {
 }
 
 TEST_CASE("A header that lies is refused") {
-  const auto with = [](const std::string& entries) { return WithHeader("{" + entries + "}", std::vector<uint8_t>(16)); };
+  const auto with = [](const std::string& entries) {
+    return WithHeader("{" + entries + "}", std::vector<uint8_t>(16));
+  };
   const std::string a = R"("a":{"dtype":"F32","shape":[2],"data_offsets":[0,8]})";
   const std::string b = R"("b":{"dtype":"F32","shape":[2],"data_offsets":[8,16]})";
   CHECK(ImageError(with(a + "," + b)) == "no error");
@@ -144,11 +157,13 @@ TEST_CASE("A header that lies is refused") {
   CHECK(ImageError(with(a + "," + a)) == "f: header: names \"a\" twice");
   CHECK(ImageError(with(R"("a":{"dtype":"F32","shape":[3],"data_offsets":[0,8]})")) ==
         "f: tensor \"a\" takes 8 bytes, its shape 3 F32 needs 12");
-  CHECK(ImageError(with(R"("a":{"dtype":"F32","shape":[1099511627776,1099511627776],"data_offsets":[0,8]})")) ==
-        "f: tensor \"a\": shape is empty or too large");
+  CHECK(
+      ImageError(with(R"("a":{"dtype":"F32","shape":[1099511627776,1099511627776],"data_offsets":[0,8]})")) ==
+      "f: tensor \"a\": shape is empty or too large");
   CHECK(ImageError(with(R"("a":{"dtype":"F32","shape":[-2],"data_offsets":[0,8]})")) ==
         "f: tensor \"a\": shape and data_offsets must be whole numbers");
-  CHECK(ImageError(with(R"("a":{"dtype":"F32","shape":[2],"data_offsets":[8,0]})")).starts_with("f: tensor \"a\" takes"));
+  CHECK(ImageError(with(R"("a":{"dtype":"F32","shape":[2],"data_offsets":[8,0]})"))
+            .starts_with("f: tensor \"a\" takes"));
   CHECK(ImageError(with(R"("a":5)")) == "f: tensor \"a\": the header lacks dtype, shape or data_offsets");
   CHECK(ImageError(WithHeader("[1,2]", {})) == "f: header: is not a JSON object");
   CHECK(ImageError(WithHeader("{\"a\"", {})) == "f: header: is not valid JSON");
@@ -176,26 +191,31 @@ TEST_CASE("Each fault of a manifest is one line") {
 }
 
 TEST_CASE("Other rooms read their own entries of the manifest") {
-  const Manifest m = Manifest::Parse(
-      ManifestText({{"pi", kSpec}}, "x", R"("rate_hz":25,"norm":{"mean":[[1,2],[3,4.5]],"names":["a","b"]},)"), "m");
+  const Manifest m =
+      Manifest::Parse(ManifestText({{"pi", kSpec}}, "x",
+                                   R"("rate_hz":25,"norm":{"mean":[[1,2],[3,4.5]],"names":["a","b"]},)"),
+                      "m");
   CHECK(m.Integer("/rate_hz") == 25);
   CHECK(m.Numbers("/norm/mean") == std::vector<double>{1, 2, 3, 4.5});
   CHECK(m.Texts("/norm/names") == std::vector<std::string>{"a", "b"});
   CHECK(m.Keys("/norm") == std::vector<std::string>{"mean", "names"});
   CHECK_FALSE(m.Has("/norm/std"));
   CHECK(ErrorOf([&] { m.Numbers("/norm/std"); }) == "m: has no \"/norm/std\"");
-  CHECK(ErrorOf([&] { m.Numbers("/norm/names"); }) == "m: \"/norm/names\" holds something that is not a finite number");
+  CHECK(ErrorOf([&] { m.Numbers("/norm/names"); }) ==
+        "m: \"/norm/names\" holds something that is not a finite number");
 }
 
 TEST_CASE("A folder loads from disk, and missing or cut files are one clear line") {
   namespace fs = std::filesystem;
-  const fs::path dir = fs::temp_directory_path() / ("intabs_weights_test_" + std::to_string(std::random_device{}()));
+  const fs::path dir =
+      fs::temp_directory_path() / ("intabs_weights_test_" + std::to_string(std::random_device{}()));
   const std::string d = dir.string();
   const auto error = [&] { return ErrorOf([&] { Network::Load(d, "pi"); }); };
   CHECK(error() == d + "/manifest.json: cannot be opened (No such file or directory)");
   fs::create_directory(dir);
   const std::vector<uint8_t> image = SafeTensorsImage(Good());
-  std::ofstream(dir / "manifest.json") << ManifestText({{"pi", kSpec}}, Sha256Hex(image.data(), image.size()));
+  std::ofstream(dir / "manifest.json")
+      << ManifestText({{"pi", kSpec}}, Sha256Hex(image.data(), image.size()));
   CHECK(error() == d + "/weights.safetensors: cannot be opened (No such file or directory)");
   const auto write = [&](size_t n) {
     std::ofstream(dir / "weights.safetensors", std::ios::binary)
@@ -206,4 +226,45 @@ TEST_CASE("A folder loads from disk, and missing or cut files are one clear line
   write(image.size());
   CHECK(error() == "no error");
   fs::remove_all(dir);
+}
+
+TEST_CASE("Damaged weights are refused with one line or load, and nothing worse") {
+  // The fuzz target's seeds, then each with bytes changed, cut out or doubled.
+  std::mt19937 rng(1);
+  int seeds = 0, refused = 0;
+  for (const auto& entry :
+       std::filesystem::directory_iterator(INTABS_SOURCE_DIR "/tests/cpp/nn/fuzz_corpus")) {
+    std::ifstream in(entry.path(), std::ios::binary);
+    const std::string seed((std::istreambuf_iterator<char>(in)), {});
+    const auto load = [](const std::string& s) {
+      return LoadFromBytes(reinterpret_cast<const uint8_t*>(s.data()), s.size());
+    };
+    INFO(entry.path());
+    REQUIRE(load(seed) == "");
+    ++seeds;
+    for (int i = 0; i < 500; ++i) {
+      std::string damaged = seed;
+      for (int changes = 1 + static_cast<int>(rng() % 3); changes > 0; --changes) {
+        const size_t at = rng() % damaged.size(), n = 1 + rng() % 8;
+        switch (rng() % 4) {
+          case 0:
+            damaged[at] = static_cast<char>(rng());
+            break;
+          case 1:
+            damaged[at] = "0123456789-{}[]\",:.eE"[rng() % 21];
+            break;
+          case 2:
+            damaged.erase(at, n);
+            break;
+          default:
+            damaged.insert(at, damaged.substr(at, n));
+            break;
+        }
+        if (damaged.empty()) damaged = "{";
+      }
+      refused += load(damaged) != "";
+    }
+  }
+  CHECK(seeds >= 6);
+  CHECK(refused > 300 * seeds);
 }

@@ -23,7 +23,8 @@ objects:
 
 // Reads the text as a file.
 PerceptionConfig Load(const std::string& text) {
-  const auto path = std::filesystem::temp_directory_path() / ("perception_" + std::to_string(::getpid()) + ".yaml");
+  const auto path =
+      std::filesystem::temp_directory_path() / ("perception_" + std::to_string(::getpid()) + ".yaml");
   std::ofstream(path) << text;
   struct Remove {
     std::filesystem::path path;

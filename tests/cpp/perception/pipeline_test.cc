@@ -68,7 +68,9 @@ struct World {
 };
 
 double Millimetres(const TrackedObject& o, const Pose& truth) { return 1e3 * (o.X_WO.p - truth.p).norm(); }
-double Degrees(const TrackedObject& o, const Pose& truth) { return AngleBetween(o.X_WO.q, truth.q) * 180 / M_PI; }
+double Degrees(const TrackedObject& o, const Pose& truth) {
+  return AngleBetween(o.X_WO.q, truth.q) * 180 / M_PI;
+}
 
 }  // namespace
 
@@ -84,7 +86,8 @@ TEST_CASE("Objects that move are found where they are, in W, from the first fram
     pipeline.Process(world.See(), i + 1, i * kFrameUs, poses, seen);
     INFO("frame " << i << ": block " << Millimetres(poses.objects[0], world.block) << " mm, "
                   << Degrees(poses.objects[0], world.block) << " deg; goal "
-                  << Millimetres(poses.objects[1], world.goal) << " mm, " << Degrees(poses.objects[1], world.goal));
+                  << Millimetres(poses.objects[1], world.goal) << " mm, "
+                  << Degrees(poses.objects[1], world.goal));
     CHECK(poses.frame_seq == i + 1);
     CHECK(poses.exposure_utime == i * kFrameUs);
     for (int o = 0; o < 2; ++o) {
@@ -127,7 +130,8 @@ TEST_CASE("A pose is held for half a second without tags, then invalid with grow
     CHECK(poses.objects[0].valid == (i <= 12));
     CHECK(poses.objects[0].cameras == 0);
   }
-  for (int i = 21; i < 29; ++i) pipeline.Process(world.See(), i + 1, i * kFrameUs, poses, seen);  // found again
+  for (int i = 21; i < 29; ++i)
+    pipeline.Process(world.See(), i + 1, i * kFrameUs, poses, seen);  // found again
   CHECK(poses.objects[0].valid);
   CHECK(poses.objects[0].age == 0);
 }
@@ -139,7 +143,8 @@ TEST_CASE("Frames without tags give invalid objects with a null pose, never a gu
   CameraDetections seen;
   const cv::Mat black(480, 640, CV_8UC1, cv::Scalar(0));
   int64_t t = 0;
-  for (const GrayImages& images : {GrayImages{black, black}, world.See({}), GrayImages{cv::Mat(), cv::Mat()}}) {
+  for (const GrayImages& images :
+       {GrayImages{black, black}, world.See({}), GrayImages{cv::Mat(), cv::Mat()}}) {
     pipeline.Process(images, 1, t += kFrameUs, poses, seen);
     for (int o = 0; o < 2; ++o) {
       CHECK(poses.objects[o].id == -1);
@@ -168,7 +173,8 @@ TEST_CASE("Swapped, black and missing images never give a wrong pose that is cal
   ObjectPoses poses;
   CameraDetections seen;
   int64_t t = 0;
-  for (int i = 0; i < Pipeline::kGroundFrames; ++i) pipeline.Process(world.See(), 1, t += kFrameUs, poses, seen);
+  for (int i = 0; i < Pipeline::kGroundFrames; ++i)
+    pipeline.Process(world.See(), 1, t += kFrameUs, poses, seen);
   const bool with_ground = GENERATE(true, false);  // the arm may hide the ground tag
   for (int i = 0; i < 16; ++i) {
     world.block.p.y() += .01;
@@ -176,10 +182,18 @@ TEST_CASE("Swapped, black and missing images never give a wrong pose that is cal
     if (!with_ground) scene.erase(0);
     GrayImages images = world.See(scene);
     switch (i % 4) {
-      case 0: std::swap(images[0], images[1]); break;
-      case 1: images[0] = cv::Mat(480, 640, CV_8UC1, cv::Scalar(0)); break;
-      case 2: images[1] = cv::Mat(); break;
-      case 3: images[0] = images[1].clone(); break;
+      case 0:
+        std::swap(images[0], images[1]);
+        break;
+      case 1:
+        images[0] = cv::Mat(480, 640, CV_8UC1, cv::Scalar(0));
+        break;
+      case 2:
+        images[1] = cv::Mat();
+        break;
+      case 3:
+        images[0] = images[1].clone();
+        break;
     }
     pipeline.Process(images, 1, t += kFrameUs, poses, seen);
     const TrackedObject& o = poses.objects[0];
@@ -250,7 +264,8 @@ TEST_CASE("Images that do not fit the configuration are refused with the sizes")
 }
 
 TEST_CASE("The covariance tells how far the poses are off") {
-  // Many corner draws for one geometry: the spread of the solutions against the covariance that the solver states.
+  // Many corner draws for one geometry: the spread of the solutions against the covariance that the solver
+  // states.
   World world;
   cv::RNG rng(23);
   std::vector<CameraModel> models{world.Placed(0), world.Placed(1)};

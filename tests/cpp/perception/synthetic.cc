@@ -16,23 +16,26 @@ namespace {
 constexpr int kCell = 32;  // px of the texture a cell
 constexpr int kSuper = 3;  // supersampling
 
-// The tag with one white cell of margin on every side, as AprilTag draws it.
 cv::Mat Texture(int id) {
-  apriltag_family_t* family = tag36h11_create();
-  image_u8_t* image = apriltag_to_image(family, id);
-  cv::Mat small(image->height, image->width, CV_8UC1);
-  for (int y = 0; y < image->height; ++y) {
-    std::copy_n(image->buf + y * image->stride, image->width, small.ptr(y));
-  }
-  std::free(image->buf);
-  std::free(image);
-  tag36h11_destroy(family);
-  cv::Mat big;
+  TagPattern pattern = Pattern(id);
+  cv::Mat small(10, 10, CV_32F, pattern.data()), big;
+  small.convertTo(small, CV_8UC1, 255);
   cv::resize(small, big, {}, kCell, kCell, cv::INTER_NEAREST);
   return big;
 }
 
 }  // namespace
+
+TagPattern Pattern(int id) {
+  apriltag_family_t* family = tag36h11_create();
+  image_u8_t* image = apriltag_to_image(family, id);
+  TagPattern pattern;
+  for (int k = 0; k < 100; ++k) pattern[k] = image->buf[k / 10 * image->stride + k % 10] > 127;
+  std::free(image->buf);
+  std::free(image);
+  tag36h11_destroy(family);
+  return pattern;
+}
 
 CameraModel VgaCamera(const std::string& name, const Pose& X_WC) {
   CameraModel camera;

@@ -1,11 +1,12 @@
-// Views of tags with exactly known poses: AprilTag's own pictures warped into a cluttered image, area-sampled,
-// blurred, with noise. Made of OpenCV alone, independent of the plant's renderer.
+// Views of tags with exactly known poses: AprilTag's own pictures warped into a cluttered image,
+// area-sampled, blurred, with noise. Made of OpenCV alone, independent of the plant's renderer.
 #pragma once
 
 #include <map>
 #include <opencv2/core.hpp>
 
 #include "intabs/perception/camera_model.h"
+#include "intabs/perception/refine.h"
 
 namespace intabs::test {
 
@@ -19,6 +20,8 @@ struct Quality {
   double blur_px = 0.8;
   double noise = 3;  // grey levels
 };
+
+TagPattern Pattern(int id);  // as AprilTag draws it
 
 // f 610 at 640 x 480, as the plant's cameras.
 CameraModel VgaCamera(const std::string& name, const Pose& X_WC);

@@ -9,7 +9,8 @@ namespace {
 
 const std::string kModels = INTABS_SOURCE_DIR "/models";
 
-// Two seconds of commands at 25 Hz with a gap in which the arm goes stale. Returns the state's hash at every policy tick.
+// Two seconds of commands at 25 Hz with a gap in which the arm goes stale. Returns the state's hash at every
+// policy tick.
 std::vector<uint64_t> Play(ArmSim& sim, int64_t seed) {
   std::mt19937 random(11);
   std::uniform_real_distribution<double> u(-0.2, 0.2);
@@ -34,7 +35,8 @@ std::vector<uint64_t> Play(ArmSim& sim, int64_t seed) {
 
 }  // namespace
 
-TEST_CASE("The same seed and commands give the same states, in a new plant and after other runs in this one") {
+TEST_CASE(
+    "The same seed and commands give the same states, in a new plant and after other runs in this one") {
   ArmSim sim(kModels, "pick_place");
   const auto first = Play(sim, 1);
   const auto other = Play(sim, 2);
@@ -76,6 +78,12 @@ TEST_CASE("The arm follows what its filter says") {
   CHECK(status.gripper_opening < 0.001);
   CHECK(status.utime == 1500000);
   CHECK(status.seq == 376);
+  sim.Reset(0, 0);
+  sim.Status(status);
+  CHECK(status.seq == 1);
+  CHECK(status.utime == 0);
+  CHECK(status.state == ArmState::kIdle);
+  CHECK(status.session == 0);
 }
 
 TEST_CASE("Where a wall clock rules, commands age by it") {
@@ -106,7 +114,8 @@ TEST_CASE("The truth names the objects of the task") {
   CHECK(truth.objects[2].id == -1);
   CHECK(truth.objects[0].valid);
   CHECK_FALSE(truth.success);
-  CHECK_THROWS_WITH(ArmSim(kModels, "no_such_task"), Catch::Contains("no_such_task") && Catch::Contains("pick_place"));
+  CHECK_THROWS_WITH(ArmSim(kModels, "no_such_task"),
+                    Catch::Contains("no_such_task") && Catch::Contains("pick_place"));
 }
 
 }  // namespace intabs

@@ -5,8 +5,8 @@ namespace intabs {
 namespace {
 
 constexpr double kDegree = M_PI / 180;
-constexpr double kReach = 0.02;   // [m] from the goal
-constexpr double kHalf = 0.022;   // of the cube [m]
+constexpr double kReach = 0.02;  // [m] from the goal
+constexpr double kHalf = 0.022;  // of the cube [m]
 
 class PickPlace final : public Task {
  public:

@@ -34,11 +34,14 @@ Eigen::Matrix<double, 6, 1> Velocity(const TaskView& v, const std::string& name)
 }  // namespace
 
 double TaskView::LinearSpeed(const std::string& name) const { return Velocity(*this, name).tail<3>().norm(); }
-double TaskView::AngularSpeed(const std::string& name) const { return Velocity(*this, name).head<3>().norm(); }
+double TaskView::AngularSpeed(const std::string& name) const {
+  return Velocity(*this, name).head<3>().norm();
+}
 
 bool TaskView::FingersTouch(const std::string& name) const {
   const int body = mj_name2id(model, mjOBJ_BODY, name.c_str());
-  const int fingers[2] = {mj_name2id(model, mjOBJ_BODY, "finger_left"), mj_name2id(model, mjOBJ_BODY, "finger_right")};
+  const int fingers[2] = {mj_name2id(model, mjOBJ_BODY, "finger_left"),
+                          mj_name2id(model, mjOBJ_BODY, "finger_right")};
   for (int i = 0; i < data->ncon; ++i) {
     const int a = model->geom_bodyid[data->contact[i].geom1], b = model->geom_bodyid[data->contact[i].geom2];
     for (const int finger : fingers) {
