@@ -3,6 +3,7 @@
 #include <pybind11/stl.h>
 
 #include "intabs/nn/network.h"
+#include "intabs/nn/reference.h"
 
 namespace py = pybind11;
 
@@ -236,6 +237,36 @@ void Bind_nn(py::module_& m) {
             b.RestoreState(j, s.data());
           },
           py::arg("j"), py::arg("state"));
+
+  using Reference = ReferenceNetwork<double>;
+  py::class_<Reference>(m, "ReferenceNetwork",
+                        "The same networks in double precision and plain Eigen, slowly: what the error of a weight\n"
+                        "format is measured against.")
+      .def_static(
+          "load",
+          [](const std::string& dir, const std::string& name) {
+            py::gil_scoped_release release;
+            return Reference(WeightsFile::Load(dir), name);
+          },
+          py::arg("dir"), py::arg("name"), "As Network.load.")
+      .def(
+          "sequence",
+          [](Reference& n, const Reference::Rows& X) {
+            if (X.rows() < 1 || X.cols() != n.spec().input) {
+              throw py::value_error("X must be (T, " + std::to_string(n.spec().input) + ") with T >= 1");
+            }
+            std::vector<Reference::Rows> heads;
+            {
+              py::gil_scoped_release release;
+              n.Sequence(X, heads);
+            }
+            py::dict out;
+            for (size_t i = 0; i < heads.size(); ++i) {
+              out[py::str(n.spec().heads[i].name)] = std::move(heads[i]);
+            }
+            return out;
+          },
+          py::arg("X"), "A whole trajectory from zero state. X: (T, input_size). Returns {head: (T, size)}, float64.");
 }
 
 }  // namespace intabs

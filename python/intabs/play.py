@@ -241,6 +241,7 @@ def _percentile(values: list[float], share: float) -> float | None:
 def _summary(options: Options, run: _Run, end_us: int, success: bool, figures: dict[str, dict]) -> dict:
     bits = run.subgoals(end_us)
     errors = run.object_errors_mm(end_us)
+    ticks = [u for u in run.skill_utimes if u <= end_us]
     control = figures["control"].get("control", {})
     perception = figures["perception"]
     return {
@@ -255,8 +256,8 @@ def _summary(options: Options, run: _Run, end_us: int, success: bool, figures: d
         ],
         "duration_s": round((end_us - run.start_us) * 1e-6, 3),
         "control": {
-            "rate_hz": control.get("rate_hz"),
-            "ticks": sum(u <= end_us for u in run.skill_utimes),
+            "rate_hz": round(1e6 * (len(ticks) - 1) / (ticks[-1] - ticks[0]), 3) if len(ticks) > 1 else None,
+            "ticks": len(ticks),
             "overruns": control.get("overruns"),
             "latency_us": control.get("latency_us"),
         },

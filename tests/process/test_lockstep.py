@@ -9,7 +9,7 @@ from intabs import play
 
 need_programs()
 
-TIMINGS = {"overruns", "rate_hz", "latency_us", "infer_us", "fps", "detect_ms"}
+TIMINGS = {"latency_us", "infer_us", "fps", "detect_ms"}
 
 
 def without_timings(figures):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch")
+torch.set_num_threads(1)  # tests share the machine; two threads that wait for each other are slower than one
 
 from intabs import _core, paths  # noqa: E402
 from intabs.data.demos import Demo, load_demos, save_demos  # noqa: E402

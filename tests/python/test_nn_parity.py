@@ -17,26 +17,31 @@ HEADS = {"agent_mean": 7, "env_mean": 12, "b": 1}
 class Model(torch.nn.Module):
     """The network of a manifest, in torch."""
 
-    def __init__(self, layers, hidden, inputs=40, input_linear=0, residual=False, bidirectional=False):
+    def __init__(self, layers, hidden, inputs=40, input_linear=0, residual=False, bidirectional=False,
+                 layer_norm=False):
         super().__init__()
         self.spec = dict(input=inputs, input_linear=input_linear, layers=layers, hidden=hidden, residual=residual,
-                         bidirectional=bidirectional, heads=HEADS)
+                         bidirectional=bidirectional, layer_norm=layer_norm, heads=HEADS)
         self.input = torch.nn.Linear(inputs, input_linear) if input_linear else torch.nn.Identity()
         width = hidden * (2 if bidirectional else 1)
         self.lstm = torch.nn.ModuleList(
             torch.nn.LSTM((input_linear or inputs) if k == 0 else width, hidden, batch_first=True,
                           bidirectional=bidirectional) for k in range(layers))
+        self.norm = torch.nn.ModuleList(
+            torch.nn.LayerNorm(width) if layer_norm and k > 0 else torch.nn.Identity() for k in range(layers))
         self.heads = torch.nn.ModuleDict({n: torch.nn.Linear(width, size) for n, size in HEADS.items()})
         self.residual = residual
         # Torch's initial weights, tripled: outputs of some size through all the layers, gates that saturate.
         with torch.no_grad():
             for p in self.lstm.parameters():
                 p *= 3
+            for p in self.norm.parameters():
+                p += 0.3 * torch.randn_like(p)
 
     def forward(self, x, state=None):
         y, new = self.input(x), []
         for k, layer in enumerate(self.lstm):
-            out, s = layer(y, None if state is None else state[k])
+            out, s = layer(self.norm[k](y), None if state is None else state[k])
             y = out + y if self.residual and k > 0 else out
             new.append(s)
         return y, new
@@ -45,6 +50,9 @@ class Model(torch.nn.Module):
         out = {}
         for name, p in self.named_parameters():
             name = name.replace("_l0", "") if name.startswith("lstm.") else name
+            if name.startswith("norm."):  # norm.3.weight -> lstm.3.norm.weight
+                _, layer, kind = name.split(".")
+                name = f"lstm.{layer}.norm.{kind}"
             out["pi." + name] = p.detach().numpy().copy()
         return out
 
@@ -94,6 +102,12 @@ def test_two_swapped_gates_are_noticed(tmp_path):
     assert worst_difference(model, write(tmp_path, model, tensors), steps=50) > 1e-2
 
 
+def test_layer_norm_agrees_with_torch(tmp_path):
+    torch.manual_seed(3)
+    model = Model(3, 64, input_linear=64, residual=True, layer_norm=True)
+    assert worst_difference(model, write(tmp_path, model, model.tensors())) <= 1e-5
+
+
 @pytest.mark.parametrize("bidirectional", [False, True])
 @pytest.mark.parametrize("residual", [False, True])
 @pytest.mark.parametrize("layers,hidden", [(1, 48), (3, 64), (8, 128)])
@@ -137,3 +151,85 @@ def test_the_binding_refuses_wrong_shapes_and_says_what_is_wrong(tmp_path):
     assert twin.step(x)["b"] == first
     net.state = state
     assert net.step(x)["b"] == first
+
+
+def test_double_precision_agrees_with_torch_in_double(tmp_path):
+    torch.manual_seed(4)
+    for bidirectional in (False, True):
+        model = Model(8, 64, residual=True, bidirectional=bidirectional)
+        write(tmp_path, model, model.tensors())
+        reference = _core.ReferenceNetwork.load(str(tmp_path), "pi")
+        X = np.random.default_rng(5).standard_normal((1000, 40))
+        model = model.double()
+        with torch.inference_mode():
+            y, _ = model(torch.from_numpy(X[None]))
+            want = {n: head(y)[0].numpy() for n, head in model.heads.items()}
+        ours = reference.sequence(X)
+        for n in want:
+            np.testing.assert_allclose(ours[n], want[n], atol=1e-12, rtol=0)
+
+
+@pytest.mark.parametrize("isa", _core.instruction_sets())
+def test_16_and_8_bit_weights_stay_close_and_cost_less_memory(tmp_path, isa):
+    torch.manual_seed(6)
+    model = Model(8, 128, residual=True)
+    write(tmp_path, model, model.tensors())
+    X = np.random.default_rng(7).standard_normal((200, 40)).astype(np.float32)
+    nets = {f: _core.Network.load(str(tmp_path), "pi", format=f, isa=isa) for f in ("fp32", "16", "8")}
+    want = _core.ReferenceNetwork.load(str(tmp_path), "pi").sequence(X)["agent_mean"]
+    scale = np.abs(want).max()
+    for f, bound in (("fp32", 1e-5), ("16", 0.05), ("8", 0.05)):
+        got = np.stack([nets[f].step(x)["agent_mean"] for x in X])
+        assert np.abs(got - want).max() <= bound * scale, f
+    assert nets["16"].weight_bytes < 0.53 * nets["fp32"].weight_bytes
+    assert nets["8"].weight_bytes < 0.30 * nets["fp32"].weight_bytes
+
+
+def test_a_batch_is_many_networks_and_gives_views_of_its_own_memory(tmp_path):
+    torch.manual_seed(8)
+    model = Model(3, 64, residual=True)
+    net = write(tmp_path, model, model.tensors())
+    batch = _core.NetworkBatch(net, 5)
+    assert len(batch) == 5
+    X = np.random.default_rng(9).standard_normal((10, 5, 40)).astype(np.float32)
+    steps = [{n: v.copy() for n, v in batch.step(x).items()} for x in X]
+    for j in range(5):
+        net.reset()
+        for t in range(10):
+            for n, v in net.step(X[t, j]).items():
+                np.testing.assert_allclose(steps[t][n][j], v, atol=1e-6)
+        np.testing.assert_allclose(batch.state(j), net.state, atol=1e-6)
+    view = batch.step(X[0])["env_mean"]
+    before = view.copy()
+    batch.step(X[1])
+    assert view.shape == (5, 12) and not view.flags.writeable and np.abs(view - before).max() > 0
+    outputs = net.outputs["b"]
+    del net
+    assert np.isfinite(outputs).all()  # the view keeps the network alive
+    batch.set_state(0, batch.state(4))
+    np.testing.assert_array_equal(batch.state(0), batch.state(4))
+    with pytest.raises(IndexError, match="rollout 5 of 5"):
+        batch.state(5)
+    with pytest.raises(ValueError, match=r"X must be \(5, 40\)"):
+        batch.step(X[0, :4])
+
+
+def test_long_calls_release_the_gil(tmp_path):
+    import threading
+
+    model = Model(8, 128, bidirectional=True)
+    net = write(tmp_path, model, model.tensors())
+    X = np.random.default_rng(1).standard_normal((20000, 40)).astype(np.float32)
+    ticks, done = [], threading.Event()
+
+    def count():
+        while not done.wait(0.001):
+            ticks.append(1)
+
+    thread = threading.Thread(target=count)
+    thread.start()
+    net.sequence(X)
+    during = len(ticks)
+    done.set()
+    thread.join()
+    assert during > 20

@@ -6,8 +6,8 @@
 namespace intabs {
 extern const Kernels kKernelsAvx512;
 namespace {
-#include "intabs/nn/kernels_avx512.inc"
 #include "intabs/nn/kernels_impl.h"
+#include "intabs/nn/kernels_impl_avx512.h"
 
 struct Vec : Avx512 {
   // 16 bit inputs as pairs (x0, x2), (x1, x3) against the even and odd bytes of a word, widened: vpmaddwd.

@@ -6,8 +6,8 @@
 namespace intabs {
 extern const Kernels kKernelsAvx512Vnni;
 namespace {
-#include "intabs/nn/kernels_avx512.inc"
 #include "intabs/nn/kernels_impl.h"
+#include "intabs/nn/kernels_impl_avx512.h"
 
 struct Vec : Avx512 {
   // 16 bit inputs as unsigned bytes, high and low: vpdpbusd takes unsigned times signed.

@@ -102,9 +102,9 @@ struct Impl {
     for (int k = i; k < n; ++k) y[k] = v[k - i];
   }
 
-  // ------------------------------------------------------------------------------- one column: a stream of
-  // weights Ahead of the loads, in bytes; crosses panels and layers, so that memory stays busy while gates
-  // are computed.
+  // ----------------------------------------------------------------------------- one column: a stream of weights
+
+  // Ahead of the loads, in bytes; crosses panels and layers, so that memory stays busy while gates are computed.
   static constexpr int kAhead = 2048;
   template <bool kFetch>
   static INTABS_INLINE void Fetch(const char* p) {
@@ -200,7 +200,7 @@ struct Impl {
     F largest = V::Zero();
     for (int k = 0; k < n; k += 16) largest = V::Max(largest, V::Abs(V::Load(x + k)));
     const float top = V::MaxLane(largest);
-    const F scale = V::Set1(top > 0 ? 32767.0f / top : 0.0f);
+    const F scale = V::Set1(top > 1e-30f ? 32767.0f / top : 0.0f);
     for (int k = 0; k < n; k += 16) V::Quantise(V::Mul(V::Load(x + k), scale), a + k / 4, b + k / 4);
     return top * (1.0f / 32767.0f);
   }
@@ -297,8 +297,8 @@ struct Impl {
     }
   }
 
-  // ---------------------------------------------------------------------- many columns: register tiles of G
-  // += W X One part (W_hh or W_ih) of one panel against n columns. G: 64 floats a column, `ldg` floats apart.
+  // ---------------------------------------------------------------- many columns: register tiles of G += W X
+  // G: 64 floats a column (the gates of one panel), `ldg` floats apart.
 
   // Columns as a part's product takes them, made once for all panels.
   struct Columns {

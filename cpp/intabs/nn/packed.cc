@@ -81,6 +81,7 @@ Cell PackedCells::cell(int i) const noexcept {
     return start;
   };
   c.bias = take(1);
+  c.h_scale = c.x_scale = c.h_sums = c.x_sums = c.bias;  // not read; but offsets are taken from them
   if (c.format == WeightFormat::k8) {
     c.h_scale = take(1);
     c.x_scale = take(1);

@@ -138,7 +138,6 @@ class Trainer:
     def train(self, progress=lambda step, text: None) -> dict:
         from torch.utils.tensorboard import SummaryWriter
 
-        self.run.mkdir(parents=True, exist_ok=True)
         writer = SummaryWriter(str(self.run), purge_step=self.step)
         total = self.config["train"]["steps"]
         valid: dict = {}
@@ -172,6 +171,7 @@ class Trainer:
         return self.run / "checkpoint.pt"
 
     def save(self) -> None:
+        self.run.mkdir(parents=True, exist_ok=True)
         partial = self.path.with_suffix(".partial")
         torch.save(
             {
