@@ -60,18 +60,19 @@ void Bind_plant(py::module_& m) {
       .def(py::init<const World&, int, int>(), py::arg("world"), py::arg("width") = 640, py::arg("height") = 480)
       .def(
           "render",
-          [](Renderer& r, const World& world, const std::string& camera, int width, int height) {
+          [](Renderer& r, const World& world, const std::string& camera) {
             Snapshot s;
             world.Save(s);
-            py::array_t<uint8_t> rgb({height, width, 3});
+            py::array_t<uint8_t> rgb({r.height(), r.width(), 3});
             uint8_t* out = rgb.mutable_data();
             const int id = r.FindCamera(camera);
-            py::gil_scoped_release release;
-            r.Render(s, id, out);
+            {
+              py::gil_scoped_release release;
+              r.Render(s, id, out);
+            }
             return rgb;
           },
-          py::arg("world"), py::arg("camera"), py::arg("width") = 640, py::arg("height") = 480,
-          "(H, W, 3) uint8 RGB; width and height must be those of the renderer.");
+          py::arg("world"), py::arg("camera"), "(H, W, 3) uint8 RGB. RuntimeError on an unknown camera.");
 }
 
 }  // namespace intabs

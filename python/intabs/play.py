@@ -97,6 +97,11 @@ class _Run:
         if m.n:
             self.fps = min(m.fps[: m.n])
 
+    def sees(self) -> bool:
+        """Perception keeps up: its newest poses are at most .2 s behind the plant."""
+        newest = max((p.exposure_utime for p in self.poses.values()), default=None)
+        return newest is not None and max(t.utime for t in self.truth.values()) - newest < 200_000
+
     @property
     def start_us(self) -> int:
         return self.skill_utimes[0]
@@ -195,7 +200,7 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
             *("--clock", options.clock, "--json", figures["control"]),
         )
         if options.perception == "tags":
-            wait_for(lambda: run.poses, 20, "intabs_perception sent no poses")
+            wait_for(run.sees, 20, "intabs_perception sent no fresh poses")
         plan = messages.plan_parts(run.plan_id, skills)
 
         def send_plan() -> None:

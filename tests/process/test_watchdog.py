@@ -32,13 +32,17 @@ def kill(process) -> None:
 
 
 def assert_slowed_down_and_holds(bench, killed_at: int) -> None:
-    """No jump on the way down, then no motion."""
+    """By way of tracking, (at speed) slowing, holding; no jump of position or speed on the way; then no motion."""
+    states = bench.states_since(killed_at)
+    assert states in ([TRACKING, HOLDING], [TRACKING, SLOWING, HOLDING]), states
     statuses = bench.heard["LITE6_STATUS"][killed_at:]
-    # 20 rad/s^2 is the filter's limit: .08 rad/s a tick of 4 ms; LCM may have lost a status.
-    for before, after in zip(statuses, statuses[1:], strict=False):
-        ticks = max(1, round((after.utime - before.utime) / 4000))
-        for a, b in zip(before.q_commanded, after.q_commanded, strict=True):
-            assert abs(b - a) <= 2.2 * 0.004 * ticks
+    # The command filter's limits, with room for a tick that came late: 2.14 rad/s, 20 rad/s^2.
+    for a, b, c in zip(statuses, statuses[1:], statuses[2:], strict=False):
+        if max(b.utime - a.utime, c.utime - b.utime) > 6000:
+            continue
+        for qa, qb, qc in zip(a.q_commanded, b.q_commanded, c.q_commanded, strict=True):
+            assert abs(qb - qa) <= 1.5 * 2.14 * 0.004
+            assert abs(qc - 2 * qb + qa) <= 1.5 * 20 * 0.004**2
     held = bench.status.q_commanded
     bench.listen(0.5)
     assert bench.status.q_commanded == held
@@ -50,7 +54,6 @@ def test_control_killed_in_mid_motion_then_a_new_one_takes_over(moving):
     old_session, killed_at = bench.status.session, len(bench.heard["LITE6_STATUS"])
     kill(bench.processes.running.pop("intabs_control"))
     bench.until(lambda: bench.status.state == HOLDING, "the arm holds", patience_s=5)
-    assert bench.states_since(killed_at) == [TRACKING, SLOWING, HOLDING]
     assert_slowed_down_and_holds(bench, killed_at)
 
     bench.control("second control")
@@ -86,7 +89,6 @@ def test_perception_killed_in_mid_motion_then_a_new_one_takes_over(moving):
     killed_at = len(bench.heard["LITE6_STATUS"])
     kill(bench.processes.running.pop("intabs_perception"))
     bench.until(lambda: bench.status.state == HOLDING, "the arm holds", patience_s=5)
-    assert bench.states_since(killed_at) == [TRACKING, SLOWING, HOLDING]
     assert bench.heard["SKILL_STATUS"][-1].end_reason == STALE_POSES
     assert_slowed_down_and_holds(bench, killed_at)
     assert "perception" in bench.processes.last_line("intabs_control")

@@ -8,7 +8,7 @@
 #include <optional>
 #include <random>
 
-#include "common/yaml_config.h"
+#include "../common/yaml_config.h"
 #include "intabs/bus/lcm_bus.h"
 #include "intabs/rt/periodic.h"
 #include "intabs/rt/stop_signal.h"
@@ -177,6 +177,7 @@ class Control {
   void RunLockstep() {
     std::optional<ArmStatus> pending;
     int64_t answered = -1;  // seq
+    int64_t asked_us = MonotonicUs();
     while (!StopRequested()) {
       if (bus_.Handle(100) < 0) throw std::runtime_error("LCM is broken on " + options_.lcm);
       DemandLife();
@@ -188,11 +189,20 @@ class Control {
           pending = s;
         }
       }
-      if (!started_ || !pending) continue;
+      if (!started_ || !pending) {
+        asked_us = MonotonicUs();
+        continue;
+      }
       if (options_.perception == "tags" && pending->last_frame_seq == 0) {
         throw std::runtime_error("the plant has no cameras: start it with --cameras, or give --perception truth");
       }
-      if (!poses_ || poses_->frame_seq != pending->last_frame_seq) continue;
+      if (!poses_ || poses_->frame_seq != pending->last_frame_seq) {
+        if (MonotonicUs() - asked_us > kSilenceUs / 2) {
+          throw std::runtime_error("no object poses of the plant's newest frame for 5 s: is intabs_perception running on " +
+                                   options_.lcm + "? Without cameras give --perception truth");
+        }
+        continue;
+      }
       answered = pending->seq;
       Answer(*pending, *poses_);
       pending.reset();

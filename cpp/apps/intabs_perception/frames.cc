@@ -1,4 +1,4 @@
-#include "intabs_perception/frames.h"
+#include "frames.h"
 
 #include <algorithm>
 #include <chrono>

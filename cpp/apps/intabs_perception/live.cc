@@ -1,4 +1,4 @@
-#include "intabs_perception/live.h"
+#include "live.h"
 
 #include <algorithm>
 #include <chrono>

@@ -4,8 +4,8 @@
 #include <opencv2/core/utility.hpp>
 
 #include "intabs/rt/stop_signal.h"
-#include "intabs_perception/frames.h"
-#include "intabs_perception/live.h"
+#include "frames.h"
+#include "live.h"
 
 namespace intabs {
 namespace {

@@ -102,23 +102,24 @@ void FastLstm::RestoreState(const float* in) noexcept {
   }
 }
 
-void FastLstm::Direction(int layer, int direction, int room, const float* X, ptrdiff_t ld, int T,
-                         float* Y) noexcept {
-  auto& d = sequence_.room[room];
+void FastLstm::Directions(int layer, int first, int last, const float* X, ptrdiff_t ld, int T, float* Y) noexcept {
   const int hidden = stack_.spec.hidden;
-  const Cell cell = stack_.cell(layer, direction);
-  const ptrdiff_t ldg = static_cast<ptrdiff_t>(cell.panels) * kPanelGates;
-  stack_.kernels->input_gates(cell, X, ld, T, d.gates.data(), d.scratch.data());
-  float* h = d.h.data();
-  float* h_new = h + stack_.padded_hidden();
-  std::fill(h, h_new, 0.0f);
-  d.c.SetZero();
-  for (int i = 0; i < T; ++i) {
-    const int t = direction == 0 ? i : T - 1 - i;
-    stack_.kernels->step_from_gates(cell, d.gates.data() + t * ldg, h, h_new, d.c.data(), i % 2 == 1,
-                                    d.scratch.data());
-    std::copy_n(h_new, hidden, Y + t * ld_out() + direction * hidden);
-    std::swap(h, h_new);
+  const ptrdiff_t padded = stack_.padded_hidden(), ldg = padded * 4;
+  for (int i = first; i <= last; ++i) {
+    auto& d = sequence_.direction[i];
+    stack_.kernels->input_gates(stack_.cell(layer, i), X, ld, T, d.gates.data(), d.scratch.data());
+    d.h.SetZero();
+    d.c.SetZero();
+  }
+  for (int tick = 0; tick < T; ++tick) {
+    const ptrdiff_t before = tick % 2 * padded, after = padded - before;
+    for (int i = first; i <= last; ++i) {
+      auto& d = sequence_.direction[i];
+      const ptrdiff_t t = i == 0 ? tick : T - 1 - tick;
+      stack_.kernels->step_from_gates(stack_.cell(layer, i), d.gates.data() + t * ldg, d.h.data() + before,
+                                      d.h.data() + after, d.c.data(), tick % 2 == 1, d.scratch.data());
+      std::copy_n(d.h.data() + after, hidden, Y + t * ld_out() + i * hidden);
+    }
   }
 }
 
@@ -129,7 +130,7 @@ const float* FastLstm::Sequence(const float* X, ptrdiff_t ld, int T, int threads
     for (auto& rows : s.rows) rows.resize(columns * width);
     if (stack_.spec.layer_norm) s.normalised.resize(columns * width);
     for (int i = 0; i < stack_.directions(); ++i) {
-      auto& d = s.room[i];
+      auto& d = s.direction[i];
       d.gates.resize(columns * kPanelGates * stack_.cell(0).panels);
       d.h.resize(2 * stack_.padded_hidden());
       d.c.resize(stack_.padded_hidden());
@@ -148,9 +149,9 @@ const float* FastLstm::Sequence(const float* X, ptrdiff_t ld, int T, int threads
     }
     float* Y = s.rows[l % 2].data();
     if (stack_.directions() == 2 && threads > 1) {
-      second_.Run([&] { Direction(l, 0, 0, in, ld_in, T, Y); }, [&] { Direction(l, 1, 1, in, ld_in, T, Y); });
+      second_.Run([&] { Directions(l, 0, 0, in, ld_in, T, Y); }, [&] { Directions(l, 1, 1, in, ld_in, T, Y); });
     } else {
-      for (int i = 0; i < stack_.directions(); ++i) Direction(l, i, 0, in, ld_in, T, Y);
+      Directions(l, 0, stack_.directions() - 1, in, ld_in, T, Y);
     }
     if (stack_.spec.residual && l > 0) {
       for (int t = 0; t < T; ++t) {

@@ -57,7 +57,8 @@ class FastLstm {
   ptrdiff_t ld_out() const { return stack_.padded_width(); }
 
  private:
-  void Direction(int layer, int direction, int room, const float* X, ptrdiff_t ld, int T, float* Y) noexcept;
+  // Y <- layer's outputs in directions first .. last. Two take turns tick by tick: neither waits for its own last gates.
+  void Directions(int layer, int first, int last, const float* X, ptrdiff_t ld, int T, float* Y) noexcept;
 
   LstmStack stack_;
   AlignedFloats h_[2];  // before and after the tick, by turns: layers x padded hidden
@@ -70,7 +71,7 @@ class FastLstm {
     AlignedFloats rows[2], normalised;
     struct {
       AlignedFloats gates, h, c, scratch;
-    } room[2];  // one a thread: a second one would only push the first out of the cache
+    } direction[2];
   } sequence_;
   SecondThread second_;
 };

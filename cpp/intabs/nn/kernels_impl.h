@@ -102,62 +102,52 @@ struct Impl {
     for (int k = i; k < n; ++k) y[k] = v[k - i];
   }
 
-  // ----------------------------------------------------------------------------- one column: a stream of weights
+  // ----------------------------------------------------------------------------- one column: a stream of
+  // weights
 
-  // Ahead of the loads, in bytes; crosses panels and layers, so that memory stays busy while gates are computed.
+  // Ahead of the loads, in bytes; crosses panels and layers, so that memory stays busy while gates are
+  // computed.
   static constexpr int kAhead = 2048;
   template <bool kFetch>
   static INTABS_INLINE void Fetch(const char* p) {
     if constexpr (kFetch) V::Prefetch(p + kAhead);
   }
 
-  // Rows from the last to the first if kDown.
-  template <bool kDown>
-  static INTABS_INLINE int Row(int i, int rows) {
-    return kDown ? rows - 1 - i : i;
-  }
   // acc[0..3] + more[0..3] += W x.
-  template <bool kFetch, bool kDown>
+  template <bool kFetch>
   static INTABS_INLINE void Fp32Rows(const char* w, const float* x, int n, F* acc, F* more) {
     F* second = V::kTwoSets ? more : acc;
-    int i = 0;
-    for (; i + 2 <= n; i += 2) {
-      const int k0 = Row<kDown>(i, n), k1 = Row<kDown>(i + 1, n);
-      const char *w0 = w + 256 * static_cast<ptrdiff_t>(k0), *w1 = w + 256 * static_cast<ptrdiff_t>(k1);
-      const F x0 = V::Set1(x[k0]), x1 = V::Set1(x[k1]);
+    int k = 0;
+    for (; k + 2 <= n; k += 2, w += 512) {
+      const F x0 = V::Set1(x[k]), x1 = V::Set1(x[k + 1]);
       INTABS_UNROLL for (int g = 0; g < 4; ++g) {
-        Fetch<kFetch>(w0 + 64 * g);
-        acc[g] = V::Fma(V::Load(w0 + 64 * g), x0, acc[g]);
+        Fetch<kFetch>(w + 64 * g);
+        acc[g] = V::Fma(V::Load(w + 64 * g), x0, acc[g]);
       }
       INTABS_UNROLL for (int g = 0; g < 4; ++g) {
-        Fetch<kFetch>(w1 + 64 * g);
-        second[g] = V::Fma(V::Load(w1 + 64 * g), x1, second[g]);
+        Fetch<kFetch>(w + 256 + 64 * g);
+        second[g] = V::Fma(V::Load(w + 256 + 64 * g), x1, second[g]);
       }
     }
-    if (i < n) {
-      const int k = Row<kDown>(i, n);
-      INTABS_UNROLL for (int g = 0; g < 4; ++g) {
-        acc[g] = V::Fma(V::Load(w + 256 * static_cast<ptrdiff_t>(k) + 64 * g), V::Set1(x[k]), acc[g]);
-      }
+    if (k < n) {
+      INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Fma(V::Load(w + 64 * g), V::Set1(x[k]), acc[g]);
     }
   }
-  template <bool kFetch, bool kDown>
-  static INTABS_INLINE void Bf16Rows(const char* w, const float* x, int rows, F* acc, F* more) {
+  template <bool kFetch>
+  static INTABS_INLINE void Bf16Rows(const char* w, const float* x, int n, F* acc, F* more) {
     F* second = V::kTwoSets ? more : acc;
-    for (int i = 0; i < rows; ++i) {
-      const int r = Row<kDown>(i, rows);
-      const char* w0 = w + 256 * static_cast<ptrdiff_t>(r);
-      const F x0 = V::Set1(x[2 * r]), x1 = V::Set1(x[2 * r + 1]);
+    for (int k = 0; k < n; k += 2, w += 256) {
+      const F x0 = V::Set1(x[k]), x1 = V::Set1(x[k + 1]);
       INTABS_UNROLL for (int g = 0; g < 4; ++g) {
-        Fetch<kFetch>(w0 + 64 * g);
-        acc[g] = V::Fma(V::LowHalf(w0 + 64 * g), x0, acc[g]);
-        second[g] = V::Fma(V::HighHalf(w0 + 64 * g), x1, second[g]);
+        Fetch<kFetch>(w + 64 * g);
+        acc[g] = V::Fma(V::LowHalf(w + 64 * g), x0, acc[g]);
+        second[g] = V::Fma(V::HighHalf(w + 64 * g), x1, second[g]);
       }
     }
   }
-  // g[0..3] += scale * (W x), x as two arrays of words from V::Quantise. `sums` is 128 * (sum of each row of
-  // W).
-  template <bool kFetch, bool kDown>
+  // g[0..3] += scale * (W x), x as two arrays of words from V::Quantise. `sums`: 128 * the sum of each row of
+  // W.
+  template <bool kFetch>
   static INTABS_INLINE void Int8Rows(const char* w, const uint32_t* a, const uint32_t* b, int rows,
                                      float x_scale, const char* scale, const char* sums, F* g) {
     for (int i = 0; i < rows;) {
@@ -165,13 +155,11 @@ struct Impl {
       INTABS_UNROLL for (int k = 0; k < 4; ++k) high[k] = low[k] = V::IZero();
       const int end = i + V::kMaxDotRows < rows ? i + V::kMaxDotRows : rows;
       const bool first = i == 0;
-      for (; i < end; ++i) {
-        const int r = Row<kDown>(i, rows);
-        const char* w0 = w + 256 * static_cast<ptrdiff_t>(r);
-        const I x0 = V::ISet1(a[r]), x1 = V::ISet1(b[r]);
+      for (; i < end; ++i, w += 256) {
+        const I x0 = V::ISet1(a[i]), x1 = V::ISet1(b[i]);
         INTABS_UNROLL for (int k = 0; k < 4; ++k) {
-          Fetch<kFetch>(w0 + 64 * k);
-          V::Dot8(w0 + 64 * k, x0, x1, &high[k], &low[k]);
+          Fetch<kFetch>(w + 64 * k);
+          V::Dot8(w + 64 * k, x0, x1, &high[k], &low[k]);
         }
       }
       INTABS_UNROLL for (int k = 0; k < 4; ++k) {
@@ -224,12 +212,12 @@ struct Impl {
     return out;
   }
   // acc[0..3] += one panel of W times x.
-  template <bool kFetch, bool kDown>
+  template <bool kFetch>
   static INTABS_INLINE void PanelTimes(WeightFormat format, const char* w, const Column& x, int n, int rows,
                                        const char* scale, const char* sums, F* acc) {
     if (format == WeightFormat::k8) {
       if constexpr (V::kHasDot8) {
-        Int8Rows<kFetch, kDown>(w, x.a, x.b, rows, x.scale, scale, sums, acc);
+        Int8Rows<kFetch>(w, x.a, x.b, rows, x.scale, scale, sums, acc);
       } else {
         Int8RowsFloat(w, x.x, n, scale, acc);
       }
@@ -238,9 +226,9 @@ struct Impl {
     F more[4];
     INTABS_UNROLL for (int g = 0; g < 4; ++g) more[g] = V::Zero();
     if (format == WeightFormat::kFp32) {
-      Fp32Rows<kFetch, kDown>(w, x.x, n, acc, more);
+      Fp32Rows<kFetch>(w, x.x, n, acc, more);
     } else {
-      Bf16Rows<kFetch, kDown>(w, x.x, rows, acc, more);
+      Bf16Rows<kFetch>(w, x.x, n, acc, more);
     }
     if (V::kTwoSets) {
       INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Add(acc[g], more[g]);
@@ -257,43 +245,32 @@ struct Impl {
     for (int p = 0; p < cell.panels; ++p) {
       F acc[4];
       INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Load(cell.bias + 256 * p + 64 * g);
-      PanelTimes<true, false>(cell.format, cell.w_hh + p * h_panel, hc, cell.hidden, cell.h_rows,
-                              cell.h_scale + 256 * p, cell.h_sums + 256 * p, acc);
+      PanelTimes<true>(cell.format, cell.w_hh + p * h_panel, hc, cell.hidden, cell.h_rows,
+                       cell.h_scale + 256 * p, cell.h_sums + 256 * p, acc);
       INTABS_UNROLL for (int g = 0; g < 4; ++g) V::Store(gates + 64 * p + 16 * g, acc[g]);
     }
     const Column xc = PrepareOne(cell.format, x, cell.input, scratch);
     for (int p = 0; p < cell.panels; ++p) {
       F acc[4];
       INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Load(gates + 64 * p + 16 * g);
-      PanelTimes<true, false>(cell.format, cell.w_ih + p * x_panel, xc, cell.input, cell.x_rows,
-                              cell.x_scale + 256 * p, cell.x_sums + 256 * p, acc);
-      Activate(acc, c + 16 * p, h_new + 16 * p);
-    }
-  }
-  // Forwards and backwards mirror each other row by row: a tick begins with the weights that the one before
-  // read last, and with the h that the one before computed first.
-  template <bool kBackwards>
-  static INTABS_INLINE void Recur(const Cell& cell, const float* gates, const Column& hc, float* h_new,
-                                  float* c) {
-    const size_t h_panel = static_cast<size_t>(cell.h_rows) * 256;
-    for (int i = 0; i < cell.panels; ++i) {
-      const int p = kBackwards ? cell.panels - 1 - i : i;
-      F acc[4];
-      INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Zero();
-      PanelTimes<false, !kBackwards>(cell.format, cell.w_hh + p * h_panel, hc, cell.hidden, cell.h_rows,
-                                     cell.h_scale + 256 * p, cell.h_sums + 256 * p, acc);
-      // Last, so that nobody waits for them: they come from far away.
-      INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Add(acc[g], V::Load(gates + 64 * p + 16 * g));
+      PanelTimes<true>(cell.format, cell.w_ih + p * x_panel, xc, cell.input, cell.x_rows,
+                       cell.x_scale + 256 * p, cell.x_sums + 256 * p, acc);
       Activate(acc, c + 16 * p, h_new + 16 * p);
     }
   }
   static void StepFromGates(const Cell& cell, const float* gates, const float* h, float* h_new, float* c,
                             bool backwards, void* scratch) noexcept {
+    const size_t h_panel = static_cast<size_t>(cell.h_rows) * 256;
     const Column hc = PrepareOne(cell.format, h, cell.hidden, scratch);
-    if (backwards) {
-      Recur<true>(cell, gates, hc, h_new, c);
-    } else {
-      Recur<false>(cell, gates, hc, h_new, c);
+    for (int i = 0; i < cell.panels; ++i) {
+      const int p = backwards ? cell.panels - 1 - i : i;
+      F acc[4];
+      INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Zero();
+      PanelTimes<false>(cell.format, cell.w_hh + p * h_panel, hc, cell.hidden, cell.h_rows,
+                        cell.h_scale + 256 * p, cell.h_sums + 256 * p, acc);
+      // Last, so that nobody waits for them: they come from far away.
+      INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Add(acc[g], V::Load(gates + 64 * p + 16 * g));
+      Activate(acc, c + 16 * p, h_new + 16 * p);
     }
   }
 
@@ -433,8 +410,8 @@ struct Impl {
         INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Load(G + j * ldg + 16 * g);
         const char *a = x.a + j * x.ld, *b = x.b + j * x.ld;
         if constexpr (V::kHasDot8) {
-          Int8Rows<false, false>(w, reinterpret_cast<const uint32_t*>(a),
-                                 reinterpret_cast<const uint32_t*>(b), rows, x.scale[j], scale, sums, acc);
+          Int8Rows<false>(w, reinterpret_cast<const uint32_t*>(a), reinterpret_cast<const uint32_t*>(b), rows,
+                          x.scale[j], scale, sums, acc);
         } else {
           Int8RowsFloat(w, reinterpret_cast<const float*>(a), length, scale, acc);
         }

@@ -105,6 +105,8 @@ Renderer::Renderer(const World& world, int width, int height) : impl_(std::make_
 
 Renderer::~Renderer() = default;
 
+int Renderer::width() const { return impl_->width; }
+int Renderer::height() const { return impl_->height; }
 int Renderer::num_cameras() const { return impl_->model->ncam; }
 
 int Renderer::FindCamera(const std::string& name) const {
@@ -119,6 +121,10 @@ int Renderer::FindCamera(const std::string& name) const {
 void Renderer::Render(const Snapshot& s, int camera, uint8_t* rgb) {
   Impl& r = *impl_;
   const mjModel* m = r.model.get();
+  if (camera < 0 || camera >= m->ncam || static_cast<int>(s.qpos.size()) != m->nq) {
+    throw std::runtime_error("no picture: camera " + std::to_string(camera) + " of " + std::to_string(m->ncam) +
+                             ", or a snapshot of another scene");
+  }
   Restore(s, m, r.data);
   // Several renderers may live in one process.
   if (eglGetCurrentContext() != r.context)

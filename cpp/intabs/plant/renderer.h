@@ -18,6 +18,8 @@ class Renderer {
   Renderer(const Renderer&) = delete;
   Renderer& operator=(const Renderer&) = delete;
 
+  int width() const;
+  int height() const;
   int num_cameras() const;                        // in the order of the scene: left, right, overview
   int FindCamera(const std::string& name) const;  // throws and lists the known ones
   void Render(const Snapshot& snapshot, int camera, uint8_t* rgb);  // H * W * 3, row 0 on top

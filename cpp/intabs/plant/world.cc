@@ -17,11 +17,18 @@ constexpr double kOpen = 0.0089;      // of a finger [m]
 constexpr double kClearance = 0.09;   // between objects at the start [m]
 constexpr int kPhysicsSteps = 2;      // a driver tick
 
+// MuJoCo's own handlers write MUJOCO_LOG.TXT where they stand, and an error waits for the Enter key.
+void InstallHandlers() {
+  mju_user_warning = [](const char*) {};  // Step() looks at mjData::warning
+  mju_user_error = [](const char* text) { throw std::runtime_error(std::string("MuJoCo: ") + text); };
+}
+
 std::string ScenePath(const std::string& models_dir, const std::string& task) {
   return models_dir + "/scenes/" + task + ".xml";
 }
 
 std::shared_ptr<mjModel> LoadModel(const std::string& path) {
+  InstallHandlers();
   char error[1000] = "";
   mjModel* m = mj_loadXML(path.c_str(), nullptr, error, sizeof(error));
   if (m == nullptr) {
@@ -77,6 +84,10 @@ World::World(const std::string& models_dir, const std::string& task)
 World::~World() = default;
 
 void World::Reset(int64_t seed, double spread_cm) {
+  if (!(spread_cm >= 0 && spread_cm <= kMaxSpread)) {  // NaN too
+    throw std::runtime_error("spread of " + std::to_string(spread_cm) + " cm; give 0 to " +
+                             std::to_string(static_cast<int>(kMaxSpread)));
+  }
   const mjModel* m = model_.get();
   mjData* d = data_.get();
   mj_resetData(m, d);
@@ -123,6 +134,8 @@ void World::Reset(int64_t seed, double spread_cm) {
 }
 
 void World::Step(const ServoTarget& target) {
+  // MuJoCo would set all its controls to zero and go on.
+  if (!target.q.allFinite() || !target.dq.allFinite()) throw std::runtime_error("the servo target is not finite");
   const mjModel* m = model_.get();
   mjData* d = data_.get();
   gripper_closed_ = target.gripper_closed;
@@ -134,6 +147,12 @@ void World::Step(const ServoTarget& target) {
     mj_step1(m, d);
     for (const int i : compensated_dofs_) d->qfrc_applied[i] = d->qfrc_bias[i];
     mj_step2(m, d);
+  }
+  for (int w = 0; w < mjNWARNING; ++w) {  // after most of them MuJoCo resets itself and goes on
+    if (d->warning[w].number > 0) {
+      throw std::runtime_error("the simulation broke down at " + std::to_string(d->time) + " s: " +
+                               mju_warningText(w, d->warning[w].lastinfo));
+    }
   }
   // What is read afterwards belongs to the new state.
   mj_kinematics(m, d);

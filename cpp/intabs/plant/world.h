@@ -37,6 +37,8 @@ struct Snapshot {
 
 class World {
  public:
+  static constexpr double kMaxSpread = 15;  // [cm]: further out objects stand in the robot's base
+
   // Loads models_dir/scenes/<task>.xml. Throws on an unknown task, a missing or broken file.
   World(const std::string& models_dir, const std::string& task);
   ~World();
@@ -44,10 +46,11 @@ class World {
   World& operator=(const World&) = delete;
 
   // Time zero, arm at home with open gripper, each object uniform in a disc of `spread_cm` about its nominal
-  // place, yaw uniform within 3 degrees per cm (30 at most).
+  // place, yaw uniform within 3 degrees per cm (30 at most). Throws if spread_cm is not within 0 .. kMaxSpread.
   void Reset(int64_t seed, double spread_cm);
 
-  // One driver tick: 4 ms, gravity compensated servos.
+  // One driver tick: 4 ms, gravity compensated servos. Throws when the target is not finite or the
+  // simulation breaks down.
   void Step(const ServoTarget& target);
 
   int64_t time_us() const;

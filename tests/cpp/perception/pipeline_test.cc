@@ -204,6 +204,28 @@ TEST_CASE("Swapped, black and missing images never give a wrong pose that is cal
   }
 }
 
+TEST_CASE("A camera that shows the ground tag elsewhere than before is not believed") {
+  World world;
+  Pipeline pipeline(world.config);
+  ObjectPoses poses;
+  CameraDetections seen;
+  int64_t t = 0;
+  for (int i = 0; i < Pipeline::kGroundFrames; ++i)
+    pipeline.Process(world.See(), 1, t += kFrameUs, poses, seen);
+  const GrayImages images = world.See();
+  // The left picture from the right camera's cable, and nothing from the left one that could contradict it.
+  pipeline.Process({cv::Mat(), images[0]}, 1, t += kFrameUs, poses, seen);
+  CHECK(seen[1].n > 0);
+  CHECK_FALSE(pipeline.in_place(1));
+  CHECK(poses.objects[0].age > 0);
+  // Moved for good: asked to, the pipeline finds its new place.
+  pipeline.RedoExtrinsics();
+  pipeline.Process({cv::Mat(), images[0]}, 1, t += kFrameUs, poses, seen);
+  CHECK(poses.objects[0].age == 0);
+  CHECK(Millimetres(poses.objects[0], world.block) < 8);
+  CHECK((pipeline.X_WC(1)->p - world.Placed(0).X_WC->p).norm() < 0.005);
+}
+
 TEST_CASE("One camera alone still gives the block, by the tags it sees") {
   World world;
   Pipeline pipeline(world.config);

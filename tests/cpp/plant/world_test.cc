@@ -71,6 +71,26 @@ std::string ErrorOf(const std::function<void()>& call) {
   return "";
 }
 
+TEST_CASE("What cannot be simulated is refused in one line, and nothing hangs") {
+  World world(kModels, "pick_place");
+  CHECK_THROWS_WITH(world.Reset(0, std::nan("")), Catch::Contains("spread"));
+  CHECK_THROWS_WITH(world.Reset(0, -1), Catch::Contains("spread"));
+  CHECK_THROWS_WITH(world.Reset(0, World::kMaxSpread + 1), Catch::Contains("spread"));
+  world.Reset(0, 2);
+  ServoTarget target;
+  target.q = World::Home();
+  target.q[1] = std::numeric_limits<double>::quiet_NaN();
+  CHECK_THROWS_WITH(world.Step(target), Catch::Contains("not finite"));
+  target.q[1] = 1e15;
+  const auto run = [&] {
+    for (int i = 0; i < 100; ++i) world.Step(target);
+  };
+  CHECK_THROWS_WITH(run(), Catch::Contains("broke down"));
+  world.Reset(0, 2);  // and a reset makes it good again
+  target.q = World::Home();
+  CHECK_NOTHROW(world.Step(target));
+}
+
 }  // namespace
 
 TEST_CASE("The same seed gives the same state after 10,000 steps, after other seeds and in a new world") {
