@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="torch (the training side) is not installed")
-from intabs import _core  # noqa: E402
 from safetensors.numpy import save_file  # noqa: E402
+
+from intabs import _core  # noqa: E402
 
 torch.set_num_threads(1)
 HEADS = {"agent_mean": 7, "env_mean": 12, "b": 1}
@@ -17,18 +18,31 @@ HEADS = {"agent_mean": 7, "env_mean": 12, "b": 1}
 class Model(torch.nn.Module):
     """The network of a manifest, in torch."""
 
-    def __init__(self, layers, hidden, inputs=40, input_linear=0, residual=False, bidirectional=False,
-                 layer_norm=False):
+    def __init__(
+        self, layers, hidden, inputs=40, input_linear=0, residual=False, bidirectional=False, layer_norm=False
+    ):
         super().__init__()
-        self.spec = dict(input=inputs, input_linear=input_linear, layers=layers, hidden=hidden, residual=residual,
-                         bidirectional=bidirectional, layer_norm=layer_norm, heads=HEADS)
+        self.spec = dict(
+            input=inputs,
+            input_linear=input_linear,
+            layers=layers,
+            hidden=hidden,
+            residual=residual,
+            bidirectional=bidirectional,
+            layer_norm=layer_norm,
+            heads=HEADS,
+        )
         self.input = torch.nn.Linear(inputs, input_linear) if input_linear else torch.nn.Identity()
         width = hidden * (2 if bidirectional else 1)
         self.lstm = torch.nn.ModuleList(
-            torch.nn.LSTM((input_linear or inputs) if k == 0 else width, hidden, batch_first=True,
-                          bidirectional=bidirectional) for k in range(layers))
+            torch.nn.LSTM(
+                (input_linear or inputs) if k == 0 else width, hidden, batch_first=True, bidirectional=bidirectional
+            )
+            for k in range(layers)
+        )
         self.norm = torch.nn.ModuleList(
-            torch.nn.LayerNorm(width) if layer_norm and k > 0 else torch.nn.Identity() for k in range(layers))
+            torch.nn.LayerNorm(width) if layer_norm and k > 0 else torch.nn.Identity() for k in range(layers)
+        )
         self.heads = torch.nn.ModuleDict({n: torch.nn.Linear(width, size) for n, size in HEADS.items()})
         self.residual = residual
         # Torch's initial weights, tripled: outputs of some size through all the layers, gates that saturate.
@@ -75,7 +89,7 @@ def worst_difference(model, net, steps=1000, reset_every=270):
             if t % reset_every == 0:
                 state = None
                 net.reset()
-            y, state = model(torch.from_numpy(X[None, t:t + 1]), state)
+            y, state = model(torch.from_numpy(X[None, t : t + 1]), state)
             ours = net.step(X[t])
             for name, head in model.heads.items():
                 worst = max(worst, np.abs(head(y)[0, 0].numpy() - ours[name]).max())
