@@ -32,30 +32,6 @@ def test_the_same_seed_twice_gives_the_same_summary(tmp_path, perception):
         assert summaries[0]["perception"]["object_error_mm"]["p50"] < 10
 
 
-@pytest.mark.parametrize("perception", ["tags", "truth"])
-def test_a_rollout_in_one_process_and_the_programs_give_the_same_trajectory(tmp_path, perception):
-    """Joint angles and true object positions after each policy tick, bit for bit."""
-    from intabs import _core
-
-    seed, spread = 5, 2.0
-    skills = play.load_plan(TASK, WEIGHTS)
-    config = str(paths.MODELS / "config" / "perception.yaml") if perception == "tags" else ""
-    z, ticks = np.array([s["z"] for s in skills], "f4"), [s["max_ticks"] for s in skills]
-    inside = _core.Rollout(str(paths.MODELS), TASK, str(WEIGHTS), config).run(seed, spread, z, ticks)
-    with Bench(tmp_path, clock="lockstep", perception=perception, seed=seed, spread=spread) as bench:
-        bench.start_all()
-        bench.play()
-        n = len(inside["q"])
-        bench.until(lambda: bench.status.utime > n * 40_000, f"{n} ticks", patience_s=120)
-        q = {s.utime: s.q for s in bench.heard["LITE6_STATUS"]}
-        p_WO = {t.utime: t.p_WO for t in bench.heard["PLANT_TRUTH"]}
-    assert n > 100
-    for k in range(n):
-        at = (k + 1) * 40_000
-        assert q[at] == tuple(inside["q"][k]), f"tick {k}"
-        assert p_WO[at] == [tuple(row) for row in inside["object_pose"][k][:, :3]], f"tick {k}"
-
-
 def commands(tmp_path, perception: str, forge: bool, ticks: int) -> dict[int, list[float]]:
     """{time: q_target} of a run in which somebody may tell lies on PLANT_TRUTH: ahead of the plant, and newer than what
     it is going to say, each object 10 cm away."""
