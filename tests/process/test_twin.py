@@ -1,4 +1,4 @@
-"""In-process rollouts and the processes over LCM are one system: the same seed gives the same trajectory, bit for bit."""
+"""In-process rollouts and the processes over LCM are one system: the same seed, the same trajectory, bit for bit."""
 
 import numpy as np
 import pytest

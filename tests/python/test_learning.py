@@ -38,7 +38,15 @@ def record(seed: int) -> Demo:
         o = session.observe()
         intent = demonstrator.step(o["q"], o["object_pose"], o["object_valid"])
         rows.append(
-            (o["utime"] * 1e-6, o["q"], o["dq"], o["gripper_closed"], o["object_pose"], o["object_valid"], intent.action)
+            (
+                o["utime"] * 1e-6,
+                o["q"],
+                o["dq"],
+                o["gripper_closed"],
+                o["object_pose"],
+                o["object_valid"],
+                intent.action,
+            )
         )
         assert session.command(intent.q_target, intent.gripper_closed) == 0
         if intent.done:
@@ -46,7 +54,7 @@ def record(seed: int) -> Demo:
     for _ in range(15):
         session.command(intent.q_target, intent.gripper_closed)
     assert session.success, session.failure_reason
-    return Demo(*(np.array(x) for x in zip(*rows)), {"task": "pick_place", "seed": seed})
+    return Demo(*(np.array(x) for x in zip(*rows, strict=True)), {"task": "pick_place", "seed": seed})
 
 
 @pytest.fixture(scope="module")

@@ -38,7 +38,13 @@ int main(int argc, char** argv) {
       ->check(CLI::Range(20, 1000000));
   app.add_option("--soak", options.soak, "lstm: also a run of so many steps for the tail, pinned")
       ->check(CLI::Range(0L, 100000000L));
-  CLI11_PARSE(app, argc, argv);
+  try {
+    app.parse(argc, argv);
+  } catch (const CLI::ParseError& e) {
+    if (e.get_exit_code() == 0) return app.exit(e);  // --help
+    std::fprintf(stderr, "intabs_bench: %s (see --help)\n", e.what());
+    return 1;
+  }
   try {
     for (const Suite& s : kSuites) {
       if (name != s.name) continue;

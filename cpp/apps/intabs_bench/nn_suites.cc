@@ -53,7 +53,7 @@ void Soak(Report& report, Network& net, const RowMatrixXf& X, long steps) {
   const auto us = [](auto d) { return std::chrono::duration<double, std::micro>(d).count(); };
 
   Samples& busy = report.rows["soak_step_fp32"];
-  busy.StartRound();
+  busy.StartRound(static_cast<size_t>(steps));
   for (long i = 0; i < steps; ++i) {
     const auto start = now();
     Must(net.Step(X.row(i % X.rows()).data()));
@@ -61,7 +61,7 @@ void Soak(Report& report, Network& net, const RowMatrixXf& X, long steps) {
   }
   const auto tick = std::chrono::duration<double, std::micro>(busy.Percentile(.5));
   Samples& empty = report.rows["soak_empty_loop"];
-  empty.StartRound();
+  empty.StartRound(static_cast<size_t>(steps));
   for (long i = 0; i < steps; ++i) {
     const auto start = now();
     auto end = start;
@@ -108,7 +108,6 @@ Report Lstm(const Options& options) {
   const auto readers = MemoryReaders();
   AlignedFloats memory;
   memory.resize(paths.front().net.weight_bytes() / sizeof(float) / 256 * 256);
-  std::map<std::string, std::string> best_reader;
   std::map<std::string, std::map<std::string, Samples>> by_reader;
 
   for (int round = 0; round < options.rounds; ++round) {
@@ -134,6 +133,7 @@ Report Lstm(const Options& options) {
         [](const auto& a, const auto& b) { return a.second.BestMedian() < b.second.BestMedian(); });
     const std::string memory_row = std::string("memory_") + f.name, step_row = std::string("step_") + f.name;
     report.rows[memory_row] = best->second;
+    report.rows[memory_row].bytes = memory.size() * f.bytes / 256 * 256;
     report.ratios[step_row + " / " + memory_row] =
         report.rows[step_row].BestMedian() / report.rows[memory_row].BestMedian();
     report.notes.push_back(memory_row + ": fastest reader is " + best->first);
@@ -142,12 +142,8 @@ Report Lstm(const Options& options) {
   for (const char* name : batch_names) {
     report.ratios[std::string(name) + " / 64 step_fp32"] = report.rows[name].BestMedian() / singles;
   }
-  for (const Path& p : paths) {
-    if (p.name.find(' ') == std::string::npos) {
-      report.notes.push_back(p.name + ": " + std::to_string(p.net.weight_bytes()) + " bytes a step, " +
-                             Name(BestIsa()));
-    }
-  }
+  for (const Path& p : paths) report.rows[p.name].bytes = p.net.weight_bytes();
+  report.notes.push_back(std::string("rows without a name behind them: ") + Name(BestIsa()));
   if (options.soak > 0) Soak(report, paths[paths.size() - std::size(kFormats)].net, X, options.soak);
   return report;
 }

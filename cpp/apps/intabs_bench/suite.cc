@@ -45,8 +45,8 @@ void Print(const Report& report) {
   std::printf("%-32s %10s %10s %10s %10s %10s %8s\n", "microseconds", "best p50", "p50", "p99", "p99.9",
               "max", "n");
   for (const auto& [name, s] : report.rows) {
-    std::printf("%-32s %10.2f %10.2f %10.2f %10.2f %10.2f %8zu\n", name.c_str(), s.BestMedian(),
-                s.Percentile(.5), s.Percentile(.99), s.Percentile(.999), s.Percentile(1), s.n());
+    std::printf("%-32s %10.2f %10.2f %10.2f %10.2f %10.2f %8zu %9zu\n", name.c_str(), s.BestMedian(),
+                s.Percentile(.5), s.Percentile(.99), s.Percentile(.999), s.Percentile(1), s.n(), s.bytes);
   }
   for (const auto& [name, r] : report.ratios) std::printf("ratio %-40s %6.3f\n", name.c_str(), r);
   for (const std::string& note : report.notes) std::printf("%s\n", note.c_str());
@@ -59,9 +59,10 @@ void WriteJson(const Report& report, const std::string& suite, const std::string
                         {"ratios", report.ratios},
                         {"notes", report.notes}};
   for (const auto& [name, s] : report.rows) {
-    out["rows"][name] = {{"p50_us", s.Percentile(.5)},    {"p99_us", s.Percentile(.99)},
-                         {"p999_us", s.Percentile(.999)}, {"max_us", s.Percentile(1)},
-                         {"best_p50_us", s.BestMedian()}, {"n", s.n()}};
+    auto& row = out["rows"][name];
+    row = {{"p50_us", s.Percentile(.5)}, {"p99_us", s.Percentile(.99)},   {"p999_us", s.Percentile(.999)},
+           {"max_us", s.Percentile(1)},  {"best_p50_us", s.BestMedian()}, {"n", s.n()}};
+    if (s.bytes > 0) row["bytes"] = s.bytes;
   }
   std::ofstream file(path);
   file << out.dump(2) << "\n";

@@ -20,12 +20,16 @@ struct Options {
 // Microseconds, one entry a sample, one list a round.
 class Samples {
  public:
-  void StartRound() { rounds_.emplace_back(); }
+  void StartRound(size_t samples) {
+    rounds_.emplace_back();
+    rounds_.back().reserve(samples);
+  }
   void Add(double us) { rounds_.back().push_back(us); }
   // Over all rounds. p in [0, 1].
   double Percentile(double p) const;
   double BestMedian() const;  // smallest of the rounds' medians: least disturbed by other programs
   size_t n() const;
+  size_t bytes = 0;  // of memory that one sample reads; 0: not stated
 
  private:
   std::vector<std::vector<double>> rounds_;
@@ -41,7 +45,7 @@ struct Report {
 template <typename F>
 void Measure(Samples& row, int samples, F&& f) {
   for (int i = 0; i < samples / 20 + 1; ++i) f();
-  row.StartRound();
+  row.StartRound(samples);
   for (int i = 0; i < samples; ++i) {
     const auto start = std::chrono::steady_clock::now();
     f();

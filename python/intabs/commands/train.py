@@ -48,5 +48,6 @@ def register(app: typer.Typer) -> None:
         with Progress("train", total=trainer.config["train"]["steps"]) as progress:
             figures = trainer.train(progress.update)
         write_json(json, figures)
-        valid = ", ".join(f"{k} {v:.4f}" for k, v in figures["valid"].items())
-        print(f"{out}: {figures['steps']} steps in {figures['seconds']:.0f} s, loss {figures['loss']:.4f}; held out: {valid}")
+        valid = ", ".join(f"{k} {v:.4f}" for k, v in figures["valid"].items()) or "nothing held out"
+        print(f"{out}: {figures['steps']} steps in {figures['seconds']:.0f} s, loss {figures['loss']:.4f}")
+        print(f"  held out: {valid}")

@@ -17,9 +17,10 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from intabs.errors import UserError
 import h5py
 import numpy as np
+
+from intabs.errors import UserError
 
 OBJECT_SLOTS = 4
 FORMAT_VERSION = 1
@@ -54,9 +55,7 @@ def save_demos(path: Path | str, demos: list[Demo], attrs: dict, valid_share: fl
         data.attrs["total"] = sum(len(d) for d in demos)
         data.attrs["format_version"] = FORMAT_VERSION
         # robomimic's readers want this attribute to be there.
-        data.attrs["env_args"] = json.dumps(
-            {"env_name": attrs.get("task", ""), "env_type": -1, "env_kwargs": {}}
-        )
+        data.attrs["env_args"] = json.dumps({"env_name": attrs.get("task", ""), "env_type": -1, "env_kwargs": {}})
         for key, value in attrs.items():
             data.attrs[key] = value
         names = np.array([f"demo_{k}" for k in range(len(demos))], dtype="S")
@@ -95,7 +94,7 @@ def _plain(value):
 
 
 def load_demos(path: Path | str, mask: str | None = None) -> tuple[list[Demo], dict]:
-    """All demonstrations, or those of `mask` (train, valid). Raises ValueError with one line on a file that is not ours."""
+    """All demonstrations, or those of `mask` (train, valid). Raises UserError on a file that is not ours."""
     path = Path(path)
     if not path.exists():
         raise UserError(f"{path}: no such file; make one with `intabs collect --out {path}`")

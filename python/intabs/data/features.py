@@ -1,4 +1,4 @@
-"""Demonstrations -> what the networks see. The features themselves are made in C++, the same code that runs on the robot."""
+"""Demonstrations -> what the networks see. Features are made in C++, by the code that runs on the robot."""
 
 from __future__ import annotations
 
@@ -77,9 +77,7 @@ class Normalizer:
             # Actions are not centred: no action is no motion. The gripper is +-1 already.
             np.append(np.maximum(np.sqrt((a[:, :6] ** 2).mean(0)), 1e-4), 1.0).astype("f4"),
             # The motion of the objects shares one scale for positions and one for rotations.
-            np.tile(
-                np.repeat([max(_rms(e, 0), 1e-4), max(_rms(e, 3), 1e-3)], 3), OBJECT_SLOTS
-            ).astype("f4"),
+            np.tile(np.repeat([max(_rms(e, 0), 1e-4), max(_rms(e, 3), 1e-3)], 3), OBJECT_SLOTS).astype("f4"),
         )
 
     def normalize_state(self, state: np.ndarray) -> np.ndarray:

@@ -146,7 +146,7 @@ def record(job: Job) -> Demo:
 
 
 def _demo(job: Job, r: _Recorder) -> Demo:
-    time_s, q, dq, gripper, pose, valid, action = (np.array(x) for x in zip(*r.ticks))
+    time_s, q, dq, gripper, pose, valid, action = (np.array(x) for x in zip(*r.ticks, strict=True))
     assert pose.shape[1] == OBJECT_SLOTS
     return Demo(
         time=time_s - time_s[0],
@@ -183,8 +183,8 @@ def collect(
     jobs: int = 1,
     progress: Callable[[int, str], None] = lambda done, text: None,
 ) -> dict:
-    """Records until `demos` of every task succeeded. Failed tries are counted and left out. Every fifth demonstration is
-    straight: no disturbance, no change of mind; plans are made from those."""
+    """Records until `demos` of every task succeeded. Failed tries are counted and left out. Every fifth
+    demonstration is straight: no disturbance, no change of mind; plans are made from those."""
     tasks = list(DEMONSTRATORS) if task == "all" else [task]
     unknown = [t for t in tasks if t not in DEMONSTRATORS]
     if unknown:

@@ -1,9 +1,9 @@
 """A scripted demonstrator: the stand-in for the person who shows the task.
 
-It sees what perception sees (OBJECT_POSES, LITE6_STATUS) and answers with joint targets, 25 Hz. Like a person it varies
-speed, way-points and grasp, pauses, is disturbed and corrects, and changes its mind: it may look at the goal first, rise
-again before grasping, put the block back, or lift it off the goal once more. Without the last, the state alone would tell
-what comes next, and skills would have nothing to say. Nothing of it is in the learned policy's path.
+It sees what perception sees (OBJECT_POSES, LITE6_STATUS) and answers with joint targets, 25 Hz. Like a person it
+varies speed, way-points and grasp, pauses, is disturbed and corrects, and changes its mind: it may look at the goal
+first, rise again before grasping, put the block back, or lift it off the goal once more. Without the last, the state
+alone would tell what comes next, and skills would have nothing to say. Nothing of it is in the learned policy's path.
 """
 
 from __future__ import annotations

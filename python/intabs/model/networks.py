@@ -93,9 +93,7 @@ class InteractionAbstractions(nn.Module):
     def __init__(self, config: dict):
         super().__init__()
         gaussian = {"mean": LATENT, "log_std": LATENT}
-        self.q_agent = Recurrent(
-            AGENT_DIM + AGENT_ACTION_DIM, heads=gaussian, bidirectional=True, **config["encoder"]
-        )
+        self.q_agent = Recurrent(AGENT_DIM + AGENT_ACTION_DIM, heads=gaussian, bidirectional=True, **config["encoder"])
         self.q_environment = Recurrent(
             ENVIRONMENT_DIM + ENVIRONMENT_ACTION_DIM, heads=gaussian, bidirectional=True, **config["encoder"]
         )
@@ -114,7 +112,7 @@ class InteractionAbstractions(nn.Module):
         return mean, log_std
 
     def act(self, state: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
-        """state (B, T, 59), z (B, 16) held over the segment -> a^r (B, T, 7), a^e (B, T, 24); hidden state from zero."""
+        """state (B, T, 59), z (B, 16) held over the segment -> a^r (B, T, 7), a^e (B, T, 24). From zero state."""
         y = self.pi(torch.cat([state, z[:, None].expand(-1, state.shape[1], -1)], -1))
         return y["agent"], y["environment"]
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from intabs.errors import UserError
 from intabs import _core
 from intabs.data.demos import Demo, load_demos
 from intabs.data.features import trajectory
+from intabs.errors import UserError
 from intabs.model.networks import InteractionAbstractions
 from intabs.train.trainer import default_arm, load_model
 
@@ -25,7 +25,7 @@ TOLERANCE = 1e-5
 
 
 def encode_demo(model: InteractionAbstractions, normalizer, demo: Demo, cut: int) -> np.ndarray:
-    """The skills of a demonstration by a fixed cut: (n, 16) means of z. A rest of half a cut or more is a skill of its own."""
+    """The skills of a demonstration by a fixed cut: (n, 16) means of z. A rest of over half a cut is a skill too."""
     t = normalizer.normalize(trajectory(demo, default_arm()))
     length = len(t.state)
     starts = list(range(0, length - cut // 2, cut))
@@ -34,8 +34,10 @@ def encode_demo(model: InteractionAbstractions, normalizer, demo: Demo, cut: int
         for a in starts:
             b = min(a + cut, length)
             mean, _ = model.encode(
-                *(torch.from_numpy(np.ascontiguousarray(x[None, a:b], "f4"))
-                  for x in (t.state, t.agent_action, t.environment_action))
+                *(
+                    torch.from_numpy(np.ascontiguousarray(x[None, a:b], "f4"))
+                    for x in (t.state, t.agent_action, t.environment_action)
+                )
             )
             rows.append(mean[0].numpy())
     return np.stack(rows)

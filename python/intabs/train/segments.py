@@ -24,12 +24,18 @@ class Segments:
 class SegmentSampler:
     """Batches of segments of equal length. Every start of every demonstration is equally likely.
 
-    trajectories: normalised. noise: {"object_mm", "object_deg"} one error an object and segment, {"tick_mm"} one a tick,
-    {"joint_mrad"} one a tick; standard deviations.
+    trajectories: normalised. noise, standard deviations: {"object_mm", "object_deg"} one error an object and segment,
+    {"tick_mm", "joint_mrad"} one a tick.
     """
 
     def __init__(
-        self, trajectories: list[Trajectory], normalizer: Normalizer, arm, length: tuple[int, int], noise: dict, device: str
+        self,
+        trajectories: list[Trajectory],
+        normalizer: Normalizer,
+        arm,
+        length: tuple[int, int],
+        noise: dict,
+        device: str,
     ):
         for i, t in enumerate(trajectories):
             if len(t.state) < length[1]:

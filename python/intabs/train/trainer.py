@@ -13,10 +13,10 @@ import numpy as np
 import torch
 import yaml
 
-from intabs.errors import UserError
 from intabs import __version__, _core
 from intabs.data.demos import load_demos
 from intabs.data.features import Normalizer, trajectory
+from intabs.errors import UserError
 from intabs.model.networks import InteractionAbstractions
 from intabs.train.objective import action_error, kl_to_standard_normal
 from intabs.train.segments import Segments, SegmentSampler
