@@ -35,15 +35,21 @@ py::dict Observe(const Session& session) {
   return d;
 }
 
+NetworkOptions FormatOptions(const std::string& format) {
+  NetworkOptions options;
+  if (!format.empty()) options.format = ParseWeightFormat(format);
+  return options;
+}
+
 // Session + skill controller: one closed-loop run.
 class Rollout {
  public:
   Rollout(const std::string& models_dir, const std::string& task, const std::string& weights_dir,
-          const std::string& perception_config)
+          const std::string& perception_config, const std::string& format)
       : session_(models_dir, task,
                  perception_config.empty() ? std::nullopt
                                            : std::optional<PerceptionConfig>(LoadPerceptionConfig(perception_config))),
-        policy_(Policy::Load(weights_dir, ArmModel::Lite6())) {}
+        policy_(Policy::Load(weights_dir, ArmModel::Lite6(), FormatOptions(format))) {}
 
   py::dict Run(int64_t seed, double spread_cm, const py::array_t<float, py::array::c_style | py::array::forcecast>& z,
                const std::vector<int>& ticks, int settle_ticks, const std::string& ablate) {
@@ -147,8 +153,9 @@ void Bind_sim(py::module_& m) {
       .def_property_readonly("state_hash", [](const Session& s) { return s.world().StateHash(); });
 
   py::class_<Rollout>(m, "Rollout", "Closed-loop runs of a plan in the plant, in process, in lockstep.")
-      .def(py::init<const std::string&, const std::string&, const std::string&, const std::string&>(),
-           py::arg("models_dir"), py::arg("task"), py::arg("weights_dir"), py::arg("perception_config") = "")
+      .def(py::init<const std::string&, const std::string&, const std::string&, const std::string&, const std::string&>(),
+           py::arg("models_dir"), py::arg("task"), py::arg("weights_dir"), py::arg("perception_config") = "",
+           py::arg("format") = "", "format of pi's weights: fp32, 16, 8; empty: the manifest's.")
       .def("run", &Rollout::Run, py::arg("seed"), py::arg("spread_cm"), py::arg("z"), py::arg("ticks"),
            py::arg("settle_ticks") = 25, py::arg("ablate") = "",
            "z (n, 16), ticks: n durations. ablate: '', 'objects' (poses frozen at their first value) or 'policy' (zeros).\n"

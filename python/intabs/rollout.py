@@ -29,6 +29,7 @@ class Setting:
     perception: str
     seed: int
     ablate: str
+    format: str = ""  # of the weights, as the network runs them; empty: the manifest's
 
 
 def wilson(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
@@ -46,11 +47,11 @@ _cache: dict = {}
 
 def run_trial(job: tuple[Setting, int]) -> dict:
     setting, trial = job
-    key = (setting.task, setting.weights, setting.perception)
+    key = (setting.task, setting.weights, setting.perception, setting.format)
     if key not in _cache:
         _cache.clear()
         config = str(paths.MODELS / "config/perception.yaml") if setting.perception == "tags" else ""
-        _cache[key] = _core.Rollout(str(paths.MODELS), setting.task, setting.weights, config)
+        _cache[key] = _core.Rollout(str(paths.MODELS), setting.task, setting.weights, config, setting.format)
     skills = load_plan(setting.task, Path(setting.weights))
     z = np.array([s["z"] for s in skills], "f4")
     ticks = [int(s["max_ticks"]) for s in skills]

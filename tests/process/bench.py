@@ -87,8 +87,12 @@ class Bench:
         self.until(lambda: self.heard["PLANT_TRUTH"], "the plant speaks")
         if self.perception_source == "tags":
             self.perception()
-            self.until(lambda: self.heard["OBJECT_POSES"], "perception speaks")
+            self.until(self.perception_keeps_up, "perception keeps up")
         self.control()
+
+    def perception_keeps_up(self) -> bool:
+        poses, truth = self.heard["OBJECT_POSES"], self.heard["PLANT_TRUTH"]
+        return bool(poses) and truth[-1].utime - poses[-1].exposure_utime < 200_000
 
     def play(self, plan_id: int = 1) -> None:
         """Sends the plan until control has taken it."""

@@ -95,9 +95,8 @@ def test_perception_killed_in_mid_motion_then_a_new_one_takes_over(moving):
 
     old_session = bench.status.session
     kill(bench.processes.running.pop("intabs_control"))
-    poses = len(bench.heard["OBJECT_POSES"])
     bench.perception("second perception")
-    bench.until(lambda: len(bench.heard["OBJECT_POSES"]) > poses, "perception speaks again")
+    bench.until(bench.perception_keeps_up, "perception keeps up again")
     bench.control("second control")
     bench.play(plan_id=2)
     bench.until(lambda: bench.status.state == TRACKING, "the new session is obeyed")

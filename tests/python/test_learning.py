@@ -219,9 +219,11 @@ def test_exported_weights_give_the_same_numbers_in_cpp(data, tmp_path):
 
     train(data, tmp_path / "run")
     out = tmp_path / "weights"
-    figures = export(tmp_path / "run", out)
+    figures = export(tmp_path / "run", out, trials=0)
     assert figures["max_abs_error"] < 1e-5
     assert verify(out) == figures["max_abs_error"]
+    errors = [figures["formats"][form]["rms_rad"] for form in ("fp32", "16", "8")]
+    assert errors[0] < 1e-6 and errors[0] < errors[1] and errors[0] < errors[2] < 1e-3
     plan = json.loads((out / "plans" / "pick_place.json").read_text())
     assert plan["task"] == "pick_place" and all(len(s["z"]) == 16 for s in plan["skills"])
     # The golden vectors can tell: other weights do not pass.

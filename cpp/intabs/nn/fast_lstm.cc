@@ -102,12 +102,14 @@ void FastLstm::RestoreState(const float* in) noexcept {
   }
 }
 
-void FastLstm::Directions(int layer, int first, int last, const float* X, ptrdiff_t ld, int T, float* Y) noexcept {
+void FastLstm::Directions(int layer, int first, int last, const float* in, ptrdiff_t ld_in, const float* X,
+                          ptrdiff_t ld, int T, float* Y) noexcept {
   const int hidden = stack_.spec.hidden;
+  const bool residual = stack_.spec.residual && layer > 0;
   const ptrdiff_t padded = stack_.padded_hidden(), ldg = padded * 4;
   for (int i = first; i <= last; ++i) {
     auto& d = sequence_.direction[i];
-    stack_.kernels->input_gates(stack_.cell(layer, i), X, ld, T, d.gates.data(), d.scratch.data());
+    stack_.kernels->input_gates(stack_.cell(layer, i), in, ld_in, T, d.gates.data(), d.scratch.data());
     d.h.SetZero();
     d.c.SetZero();
   }
@@ -116,9 +118,16 @@ void FastLstm::Directions(int layer, int first, int last, const float* X, ptrdif
     for (int i = first; i <= last; ++i) {
       auto& d = sequence_.direction[i];
       const ptrdiff_t t = i == 0 ? tick : T - 1 - tick;
+      const float* h = d.h.data() + after;
       stack_.kernels->step_from_gates(stack_.cell(layer, i), d.gates.data() + t * ldg, d.h.data() + before,
-                                      d.h.data() + after, d.c.data(), tick % 2 == 1, d.scratch.data());
-      std::copy_n(d.h.data() + after, hidden, Y + t * ld_out() + i * hidden);
+                                      d.h.data() + after, d.c.data(), d.scratch.data());
+      float* y = Y + t * ld_out() + i * hidden;
+      if (residual) {
+        const float* x = X + t * ld + i * hidden;
+        for (int k = 0; k < hidden; ++k) y[k] = h[k] + x[k];
+      } else {
+        std::copy_n(h, hidden, y);
+      }
     }
   }
 }
@@ -138,7 +147,6 @@ const float* FastLstm::Sequence(const float* X, ptrdiff_t ld, int T, int threads
     }
     s.T = T;
   }
-  const int width = stack_.spec.layer_output();
   for (int l = 0; l < stack_.num_layers(); ++l) {
     const float* in = X;
     ptrdiff_t ld_in = ld;
@@ -149,14 +157,10 @@ const float* FastLstm::Sequence(const float* X, ptrdiff_t ld, int T, int threads
     }
     float* Y = s.rows[l % 2].data();
     if (stack_.directions() == 2 && threads > 1) {
-      second_.Run([&] { Directions(l, 0, 0, in, ld_in, T, Y); }, [&] { Directions(l, 1, 1, in, ld_in, T, Y); });
+      second_.Run([&] { Directions(l, 0, 0, in, ld_in, X, ld, T, Y); },
+                  [&] { Directions(l, 1, 1, in, ld_in, X, ld, T, Y); });
     } else {
-      Directions(l, 0, stack_.directions() - 1, in, ld_in, T, Y);
-    }
-    if (stack_.spec.residual && l > 0) {
-      for (int t = 0; t < T; ++t) {
-        for (int k = 0; k < width; ++k) Y[t * ld_out() + k] += X[t * ld + k];
-      }
+      Directions(l, 0, stack_.directions() - 1, in, ld_in, X, ld, T, Y);
     }
     X = Y;
     ld = ld_out();

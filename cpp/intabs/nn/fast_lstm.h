@@ -57,8 +57,10 @@ class FastLstm {
   ptrdiff_t ld_out() const { return stack_.padded_width(); }
 
  private:
-  // Y <- layer's outputs in directions first .. last. Two take turns tick by tick: neither waits for its own last gates.
-  void Directions(int layer, int first, int last, const float* X, ptrdiff_t ld, int T, float* Y) noexcept;
+  // Y <- the layer's outputs in directions first .. last, from `in`, with the residual path from X (the same
+  // but for layer norm). Two directions take turns tick by tick: neither waits for its own last gates.
+  void Directions(int layer, int first, int last, const float* in, ptrdiff_t ld_in, const float* X,
+                  ptrdiff_t ld, int T, float* Y) noexcept;
 
   LstmStack stack_;
   AlignedFloats h_[2];  // before and after the tick, by turns: layers x padded hidden

@@ -67,11 +67,9 @@ struct Kernels {
                void* scratch) noexcept;
   // gates[j] <- W_ih X[j] + b for n columns; a column of gates is panels * 64 floats, panel by panel.
   void (*input_gates)(const Cell&, const float* X, ptrdiff_t ld, int n, float* gates, void* scratch) noexcept;
-  // One column whose input products are there: h_new, c <- cell(gates, h, c). Panels are taken from the last
-  // to the first if `backwards`: by turns, so that each tick begins with what the one before has left in the
-  // cache.
+  // One column whose input products are there: h_new, c <- cell(gates, h, c).
   void (*step_from_gates)(const Cell&, const float* gates, const float* h, float* h_new, float* c,
-                          bool backwards, void* scratch) noexcept;
+                          void* scratch) noexcept;
   // n columns at once. `gates`: n * 64 floats of room.
   void (*batch)(const Cell&, const float* X, ptrdiff_t ldx, const float* H, float* H_new, float* C,
                 ptrdiff_t ldh, int n, float* gates, void* scratch) noexcept;

@@ -259,11 +259,10 @@ struct Impl {
     }
   }
   static void StepFromGates(const Cell& cell, const float* gates, const float* h, float* h_new, float* c,
-                            bool backwards, void* scratch) noexcept {
+                            void* scratch) noexcept {
     const size_t h_panel = static_cast<size_t>(cell.h_rows) * 256;
     const Column hc = PrepareOne(cell.format, h, cell.hidden, scratch);
-    for (int i = 0; i < cell.panels; ++i) {
-      const int p = backwards ? cell.panels - 1 - i : i;
+    for (int p = 0; p < cell.panels; ++p) {
       F acc[4];
       INTABS_UNROLL for (int g = 0; g < 4; ++g) acc[g] = V::Zero();
       PanelTimes<false>(cell.format, cell.w_hh + p * h_panel, hc, cell.hidden, cell.h_rows,

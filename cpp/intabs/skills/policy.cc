@@ -24,9 +24,11 @@ void Demand(bool ok, const std::string& dir, const std::string& what) {
 
 }  // namespace
 
-Policy Policy::Load(const std::string& dir, const ArmModel& arm) { return FromWeights(WeightsFile::Load(dir), arm); }
+Policy Policy::Load(const std::string& dir, const ArmModel& arm, const NetworkOptions& options) {
+  return FromWeights(WeightsFile::Load(dir), arm, options);
+}
 
-Policy Policy::FromWeights(const WeightsFile& weights, const ArmModel& arm) {
+Policy Policy::FromWeights(const WeightsFile& weights, const ArmModel& arm, const NetworkOptions& options) {
   const std::string& dir = weights.label();
   const Manifest& manifest = weights.manifest();
   const std::string layout = manifest.Text("/state_layout");
@@ -34,7 +36,7 @@ Policy Policy::FromWeights(const WeightsFile& weights, const ArmModel& arm) {
   const int64_t period = manifest.Integer("/policy_period_us");
   Demand(period == kPolicyPeriodUs, dir,
          "policy period " + std::to_string(period) + " us, this program runs at " + std::to_string(kPolicyPeriodUs));
-  Policy policy(arm, Network(weights, "pi"));
+  Policy policy(arm, Network(weights, "pi", options));
   const NetworkSpec& spec = manifest.network("pi");
   Demand(spec.input == kStateDim + kLatentDim, dir,
          "pi takes " + std::to_string(spec.input) + " inputs, the state layout and z give " +

@@ -31,8 +31,8 @@ class Policy {
  public:
   // Loads `pi` from a weights folder (weights.safetensors + manifest.json). Throws std::runtime_error with one line that
   // names what does not fit.
-  static Policy Load(const std::string& weights_dir, const ArmModel& arm);
-  static Policy FromWeights(const WeightsFile& weights, const ArmModel& arm);
+  static Policy Load(const std::string& weights_dir, const ArmModel& arm, const NetworkOptions& options = {});
+  static Policy FromWeights(const WeightsFile& weights, const ArmModel& arm, const NetworkOptions& options = {});
 
   void Reset() noexcept { pi_.Reset(); }
   // Real-time safe. kInvalidInput if a reading or the output is not finite.

@@ -16,6 +16,9 @@ def register(app: typer.Typer) -> None:
     def export(
         run: Annotated[Path, typer.Argument(help="Folder of a training run.")],
         out: Annotated[Path, typer.Option(help="Weights folder to write, e.g. models/weights/NAME.")],
+        trials: Annotated[
+            int, typer.Option(help="Closed-loop runs for each weight format (fp32, 16, 8 bit); 0: none.", min=0)
+        ] = 20,
         json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
     ) -> None:
         """Write weights, manifest, golden vectors and plans; load them in C++ and compare before it counts as done."""
@@ -23,6 +26,11 @@ def register(app: typer.Typer) -> None:
             from intabs.train.export import export as write
         except ModuleNotFoundError as e:
             raise UserError(f"{e.name} is not installed: run tools/setup (without --runtime-only)") from None
-        figures = write(run, out)
+        figures = write(run, out, trials)
         write_json(json, figures)
         print(f"{out}: {figures['tensors']} tensors, C++ within {figures['max_abs_error']:.1e} of torch")
+        for name, f in figures["formats"].items():
+            line = f"  {name:>4}: joint steps within {f['max_rad']:.1e} rad (rms {f['rms_rad']:.1e}) of torch"
+            if loop := f.get("closed_loop"):
+                line += "".join(f"; {task} {n} of {loop['trials']}" for task, n in loop["success"].items())
+            print(line)

@@ -17,6 +17,7 @@ from intabs.data.demos import Demo, load_demos
 from intabs.data.features import trajectory
 from intabs.errors import UserError
 from intabs.model.networks import InteractionAbstractions
+from intabs.rollout import UNSEEN, Setting, run_trial
 from intabs.train.trainer import default_arm, load_model
 
 SCHEMA = 1
@@ -63,8 +64,9 @@ def make_plan(model, normalizer, demo: Demo, cut: int, source: str) -> dict:
     }
 
 
-def export(run: Path | str, out: Path | str) -> dict:
-    """Returns {sha256, tensors, max_abs_error}; raises ValueError if C++ and torch disagree by more than 1e-5."""
+def export(run: Path | str, out: Path | str, trials: int = 20) -> dict:
+    """Returns {sha256, tensors, max_abs_error, formats}. `trials`: closed-loop runs of each weight format, 0: none.
+    Raises UserError if C++ and torch disagree by more than 1e-5."""
     from safetensors.torch import save_file
 
     model, normalizer, checkpoint = load_model(run)
@@ -119,7 +121,41 @@ def export(run: Path | str, out: Path | str) -> dict:
     error = verify(out)
     if not error <= TOLERANCE:
         raise UserError(f"{out}: the C++ network differs from torch by {error:.2e}, more than {TOLERANCE:.0e}")
-    return {"sha256": sha256, "tensors": len(tensors), "max_abs_error": error}
+    held_out, _ = load_demos(checkpoint["data"]["path"], "valid")
+    formats = format_report(out, model, normalizer, held_out or demos, cut, trials)
+    return {"sha256": sha256, "tensors": len(tensors), "max_abs_error": error, "formats": formats}
+
+
+FORMATS = ("fp32", "16", "8")
+
+
+def format_report(out: Path, model, normalizer, demos: list[Demo], cut: int, trials: int) -> dict:
+    """What each weight format costs: largest and root mean square difference of the joint steps from torch [rad a tick]
+    on these demonstrations, segment by segment, and closed-loop success in the plant (truth, spread 2 cm)."""
+    segments = []
+    for demo in demos:
+        t = normalizer.normalize(trajectory(demo, default_arm()))
+        z = encode_demo(model, normalizer, demo, cut)
+        segments += [(t.state[k * cut : (k + 1) * cut], z[k]) for k in range(len(z))]
+    report = {}
+    for form in FORMATS:
+        pi = _core.Network.load(str(out), "pi", format=form)
+        differences = []
+        for state, z in segments:
+            x = np.concatenate([state, np.tile(z, (len(state), 1))], axis=1)
+            with torch.no_grad():
+                want = model.act(torch.from_numpy(state)[None], torch.from_numpy(z)[None])[0][0].numpy()
+            pi.reset()
+            got = np.stack([pi.step(row)["agent"] for row in x])
+            differences.append((got - want)[:, :6] * normalizer.agent_action_scale[:6])
+        d = np.concatenate(differences)
+        report[form] = {"max_rad": float(np.abs(d).max()), "rms_rad": float(np.sqrt((d**2).mean()))}
+        if trials:
+            report[form]["closed_loop"] = {"trials": trials, "success": {}}
+            for task in sorted({d.attrs["task"] for d in demos}):
+                jobs = [(Setting(task, str(out), 2.0, "truth", UNSEEN, "", form), i) for i in range(trials)]
+                report[form]["closed_loop"]["success"][task] = sum(run_trial(job)["success"] for job in jobs)
+    return report
 
 
 def verify(weights: Path | str) -> float:
