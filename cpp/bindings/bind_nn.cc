@@ -239,9 +239,10 @@ void Bind_nn(py::module_& m) {
           py::arg("j"), py::arg("state"));
 
   using Reference = ReferenceNetwork<double>;
-  py::class_<Reference>(m, "ReferenceNetwork",
-                        "The same networks in double precision and plain Eigen, slowly: what the error of a weight\n"
-                        "format is measured against.")
+  py::class_<Reference>(
+      m, "ReferenceNetwork",
+      "The same networks in double precision and plain Eigen, slowly: what the error of a weight\n"
+      "format is measured against.")
       .def_static(
           "load",
           [](const std::string& dir, const std::string& name) {
@@ -266,7 +267,8 @@ void Bind_nn(py::module_& m) {
             }
             return out;
           },
-          py::arg("X"), "A whole trajectory from zero state. X: (T, input_size). Returns {head: (T, size)}, float64.");
+          py::arg("X"),
+          "A whole trajectory from zero state. X: (T, input_size). Returns {head: (T, size)}, float64.");
 }
 
 }  // namespace intabs

@@ -20,6 +20,7 @@ WEIGHTS = "lite6"
 SUBGOALS = {"pick_place": ("grasped", "lifted", "placed")}
 SETTLE_S = 2.0  # after the plan's end: so long may success take to show
 TICK_S = 0.04  # policy
+MAX_SKILL_TICKS = 15000  # skills/skill_player.h
 
 # skills/skill_player.h EndReason
 RUNNING, FINISHED = 1, 2
@@ -53,7 +54,12 @@ def load_plan(task: str, weights: Path) -> list[dict]:
     try:
         skills = json.loads(path.read_text())["skills"]
         messages.plan_parts(1, skills)
-    except (ValueError, KeyError, TypeError) as e:
+        for number, skill in enumerate(skills):
+            if len(skill["z"]) != 16 or not all(abs(v) < 1e6 for v in skill["z"]):
+                raise ValueError(f"skill {number}: z must be 16 finite numbers")
+            if not 1 <= int(skill["min_ticks"]) <= int(skill["max_ticks"]) <= MAX_SKILL_TICKS:
+                raise ValueError(f"skill {number}: needs 1 <= min_ticks <= max_ticks <= {MAX_SKILL_TICKS}")
+    except (ValueError, KeyError, TypeError, OverflowError) as e:
         raise UserError(f"{path}: not a plan ({type(e).__name__}: {e}); export the weights again") from None
     if not skills:
         raise UserError(f"{path}: has no skills; export the weights again")

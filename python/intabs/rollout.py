@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -14,7 +13,8 @@ import numpy as np
 
 from intabs import _core, paths
 from intabs.errors import UserError, as_user_error
-from intabs.play import load_plan
+from intabs.jobs import in_processes
+from intabs.play import END_REASONS, load_plan
 
 ABLATIONS = ("", "objects", "z", "policy")
 UNSEEN = 1_000_000  # seeds of rollouts start here; `intabs collect` counts up from 0
@@ -42,11 +42,25 @@ def wilson(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
     return max(0.0, centre - half), min(1.0, centre + half)
 
 
+def _whole_lines(path: Path) -> list[dict]:
+    lines = []
+    for line in path.read_text().splitlines():
+        try:
+            lines.append(json.loads(line))
+        except ValueError:
+            break
+    return lines
+
+
 _cache: dict = {}
 
 
 def run_trial(job: tuple[Setting, int]) -> dict:
-    setting, trial = job
+    with as_user_error(RuntimeError, ValueError, TypeError):
+        return _run_trial(*job)
+
+
+def _run_trial(setting: Setting, trial: int) -> dict:
     key = (setting.task, setting.weights, setting.perception, setting.format)
     if key not in _cache:
         _cache.clear()
@@ -61,6 +75,8 @@ def run_trial(job: tuple[Setting, int]) -> dict:
     result = _cache[key].run(seed, setting.spread, z, ticks, SETTLE_TICKS, setting.ablate)
     for trace in ("q", "gripper", "object_pose"):
         result.pop(trace)
+    if not result["success"] and result["end_reason"] in END_REASONS:
+        result["reason"] = END_REASONS[result["end_reason"]]
     return {"trial": trial, "seed": seed, **result}
 
 
@@ -81,36 +97,37 @@ def rollout(
     `resume` runs only those that are missing there."""
     if ablate not in ABLATIONS:
         raise UserError(f"--ablate {ablate}: known are objects, z, policy")
-    weights = Path(weights)
-    if not weights.is_dir() and (paths.MODELS / "weights" / weights).is_dir():
-        weights = paths.MODELS / "weights" / weights
-    with as_user_error(RuntimeError):
+    shipped = paths.MODELS / "weights" / weights
+    weights = shipped if shipped.is_dir() else Path(weights)
+    with as_user_error(RuntimeError, ValueError):  # before any trial
         load_plan(task, weights)
-        _core.Network.load(str(weights), "pi")
+        _core.Rollout(str(paths.MODELS), task, str(weights))
+    sha256 = json.loads((weights / "manifest.json").read_text())["sha256"]
     setting = Setting(task, str(weights), spread, perception, seed, ablate)
     results: dict[int, dict] = {}
     log = None
     if report is not None:
         report.mkdir(parents=True, exist_ok=True)
         path = report / "trials.jsonl"
-        header = {"setting": asdict(setting)}
+        header = {"setting": asdict(setting), "sha256": sha256}
         if resume and path.exists():
-            lines = [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
+            lines = _whole_lines(path)
             if not lines or lines[0] != header:
                 raise UserError(f"{path}: was made with other settings; give another --report, or leave out --resume")
             results = {r["trial"]: r for r in lines[1:] if r["trial"] < trials}
-            log = path.open("a")
-        else:
-            log = path.open("w")
-            print(json.dumps(header), file=log, flush=True)
-    missing = [(setting, i) for i in range(trials) if i not in results]
-    with multiprocessing.get_context("spawn").Pool(jobs) as pool:
-        for r in pool.imap_unordered(run_trial, missing):
-            results[r["trial"]] = r
-            if log is not None:
-                print(json.dumps(r), file=log, flush=True)
-            good = sum(x["success"] for x in results.values())
-            progress(len(results), f"{good} of {len(results)} succeeded")
+        elif path.exists():
+            raise UserError(f"{path} is there already: add --resume, or give another --report")
+        # Written anew: the last line of an interrupted run may be cut.
+        log = path.open("w")
+        for line in (header, *results.values()):
+            print(json.dumps(line), file=log, flush=True)
+    missing = ((setting, i) for i in range(trials) if i not in results)
+    for r in in_processes(run_trial, missing, jobs):
+        results[r["trial"]] = r
+        if log is not None:
+            print(json.dumps(r), file=log, flush=True)
+        good = sum(x["success"] for x in results.values())
+        progress(len(results), f"{good} of {len(results)} succeeded")
     if log is not None:
         log.close()
     done = [results[i] for i in range(trials)]

@@ -123,6 +123,8 @@ class Control {
 
   void OnStatus(const ArmStatus& s) {
     heard_us_ = MonotonicUs();
+    if (s.source != source_) poses_.reset();  // another plant or driver: what was seen before is of another world
+    source_ = s.source;
     // Lockstep: only statuses on the policy's grid are answered; the plant waits there.
     if (options_.clock == "lockstep" && s.utime % kPolicyPeriodUs != 0) return;
     status_.Offer(s);
@@ -145,7 +147,7 @@ class Control {
     }
     started_ = true;
     said_ = false;
-    heard_us_ = MonotonicUs();
+    started_us_ = heard_us_ = MonotonicUs();
     PublishSkillStatus();
   }
 
@@ -171,6 +173,11 @@ class Control {
     if (started_ && MonotonicUs() - heard_us_ > kSilenceUs) {
       throw std::runtime_error("no LITE6_STATUS for 10 s: is intabs_plant or intabs_lite6 still running on " +
                                options_.lcm + "?");
+    }
+    if (started_ && !poses_ && MonotonicUs() - started_us_ > kSilenceUs) {
+      throw std::runtime_error(options_.perception == "tags"
+                                   ? "no OBJECT_POSES for 10 s: is intabs_perception running, has the plant cameras?"
+                                   : "no PLANT_TRUTH for 10 s: --perception truth needs intabs_plant");
     }
   }
 
@@ -279,6 +286,8 @@ class Control {
   bool started_ = false;
   bool said_ = false;
   int64_t heard_us_ = 0;
+  int64_t started_us_ = 0;
+  int64_t source_ = 0;
   int64_t ticks_ = 0, overruns_ = 0, first_tick_us_ = 0, last_tick_us_ = 0;
   int64_t skill_seq_ = 0, loop_seq_ = 0, loop_status_us_ = 0;
   TickStats tick_us_, infer_us_;

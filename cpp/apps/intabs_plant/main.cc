@@ -22,7 +22,7 @@ int Main(int argc, char** argv) {
       ->capture_default_str();
   app.add_option("--seed", o.seed, "where the objects stand")->capture_default_str();
   app.add_option("--spread", o.spread, "how far from their nominal places at most, cm")
-      ->check(CLI::Range(0.0, 100.0))
+      ->check(CLI::Range(0.0, World::kMaxSpread))
       ->capture_default_str();
   app.add_option("--clock", o.clock, "lockstep: simulation waits for each command; wall: nobody waits")
       ->check(CLI::IsMember({"lockstep", "wall"}))

@@ -170,8 +170,8 @@ void Plant::OnControl(const PlantControl& c) {
     reason = "the arm is in fault or stopped: send RESET first";
   } else if (sim_.controller().Busy(NowUs())) {
     reason = "a session runs";
-  } else if (!(c.spread >= 0 && c.spread <= 100)) {
-    reason = "the spread must be 0 to 100 cm";
+  } else if (!(c.spread >= 0 && c.spread <= World::kMaxSpread)) {
+    reason = "the spread must be 0 to 15 cm";
   }
   if (reason != nullptr) {
     std::fprintf(stderr, "intabs_plant: PLANT_CONTROL refused: %s\n", reason);

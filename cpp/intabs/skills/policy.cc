@@ -15,6 +15,7 @@ Vector ReadVector(const Manifest& manifest, const std::string& dir, const std::s
                              " numbers, this program needs " + std::to_string(v.size()));
   }
   for (int i = 0; i < v.size(); ++i) v[i] = static_cast<float>(numbers[i]);
+  if (!v.allFinite()) throw std::runtime_error(dir + "/manifest.json: " + path + " holds a number too large for float");
   return v;
 }
 
@@ -50,11 +51,19 @@ Policy Policy::FromWeights(const WeightsFile& weights, const ArmModel& arm, cons
   const StateVector scale = ReadVector<StateVector>(manifest, dir, "/normalizer/state_scale");
   Demand((scale.array() > 0).all(), dir, "/normalizer/state_scale must be positive");
   policy.normalizer_.inverse_scale = scale.cwiseInverse();
+  Demand((policy.normalizer_.inverse_scale.array() > 0).all() && policy.normalizer_.inverse_scale.allFinite(), dir,
+         "/normalizer/state_scale holds a number that is too large or too small");
   policy.normalizer_.limit = static_cast<float>(manifest.Number("/normalizer/limit"));
+  Demand(policy.normalizer_.limit > 0, dir, "/normalizer/limit must be positive");
   policy.agent_scale_ =
       ReadVector<Eigen::Matrix<float, kAgentActionDim, 1>>(manifest, dir, "/normalizer/agent_action_scale");
   policy.environment_scale_ =
       ReadVector<Eigen::Matrix<float, kEnvironmentActionDim, 1>>(manifest, dir, "/normalizer/environment_action_scale");
+  Demand((policy.agent_scale_.array() > 0).all() && (policy.environment_scale_.array() > 0).all(), dir,
+         "/normalizer/agent_action_scale and environment_action_scale must be positive");
+  // A step of a radian a tick is ten times what the arm can do: such weights are broken.
+  Demand((policy.agent_scale_.head<kNumJoints>().array() < 1).all(), dir,
+         "/normalizer/agent_action_scale holds a joint step of 1 rad a tick or more");
   return policy;
 }
 

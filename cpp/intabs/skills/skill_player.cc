@@ -5,7 +5,7 @@ namespace intabs {
 Status SkillPlayer::Start(int64_t plan_id, std::span<const Skill> skills) noexcept {
   if (skills.empty() || skills.size() > kMaxSkills) return Status::kOutOfRange;
   for (const Skill& s : skills) {
-    if (s.min_ticks < 1 || s.max_ticks < s.min_ticks || !s.z.allFinite()) return Status::kOutOfRange;
+    if (s.min_ticks < 1 || s.max_ticks < s.min_ticks || s.max_ticks > kMaxSkillTicks || !s.z.allFinite()) return Status::kOutOfRange;
   }
   std::copy(skills.begin(), skills.end(), skills_.begin());
   status_ = {plan_id, 0, static_cast<int>(skills.size()), 0.f, EndReason::kRunning};

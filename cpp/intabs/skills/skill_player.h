@@ -20,7 +20,8 @@ struct Skill {
   int32_t max_ticks = 1;
 };
 
-inline constexpr int kMaxSkills = 128;  // in a plan
+inline constexpr int kMaxSkills = 128;       // in a plan
+inline constexpr int kMaxSkillTicks = 15000;  // 10 minutes
 
 // Why the player is not playing. The numbers travel in SKILL_STATUS.
 enum class EndReason : int8_t {
@@ -46,7 +47,7 @@ class SkillPlayer {
   explicit SkillPlayer(Policy policy) : policy_(std::move(policy)) {}
 
   // Replaces the plan; integration starts at the next Tick from `q_commanded` given there. Real-time safe.
-  // kOutOfRange if the plan is empty, longer than kMaxSkills, or a skill's duration is not 1 <= min <= max.
+  // kOutOfRange if the plan is empty, longer than kMaxSkills, or a skill's duration is not 1 <= min <= max <= kMaxSkillTicks.
   Status Start(int64_t plan_id, std::span<const Skill> skills) noexcept;
 
   // One policy tick: the next joint target [rad] and gripper bit. Real-time safe.

@@ -20,8 +20,10 @@ def register(app: typer.Typer) -> None:
         perception: Annotated[
             Perception, typer.Option(help="Where object poses come from: cameras and tags, or the simulator itself.")
         ] = Perception.tags,
-        seed: Annotated[int, typer.Option(help="Seed of the first demonstration.", min=0)] = 0,
-        spread: Annotated[float, typer.Option(help="How far objects lie from their nominal place, cm.", min=0)] = 2.0,
+        seed: Annotated[int, typer.Option(help="Seed of the first demonstration.", min=0, max=2**62)] = 0,
+        spread: Annotated[
+            float, typer.Option(help="How far objects lie from their nominal place, cm.", min=0, max=15)
+        ] = 2.0,
         disturb: Annotated[
             float, typer.Option(help="Size of the disturbances that the demonstrator corrects; 0: none.", min=0)
         ] = 1.0,

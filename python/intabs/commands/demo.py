@@ -32,7 +32,7 @@ def register(app: typer.Typer) -> None:
         clock: Annotated[
             Clock, typer.Option(help="lockstep: repeatable, as fast as it goes; wall: real time.")
         ] = Clock.lockstep,
-        seed: Annotated[int, typer.Option(help="Where the objects lie.", min=0)] = 0,
+        seed: Annotated[int, typer.Option(help="Where the objects lie.", min=0, max=2**62)] = 0,
         out: Annotated[Path, typer.Option(help="Folder for summary, pictures, video and logs.")] = Path("out/demo"),
         viewer: Annotated[bool, typer.Option("--viewer", help="Open a window on the simulation.")] = False,
         json: Annotated[Path | None, typer.Option(help="Write the summary there as well.")] = None,

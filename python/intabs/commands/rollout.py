@@ -24,12 +24,16 @@ def register(app: typer.Typer) -> None:
     def rollout(
         task: Annotated[str, typer.Option(help="What to do.")],
         trials: Annotated[int, typer.Option(help="Trials, each with a seed of its own.", min=1)],
-        spread: Annotated[float, typer.Option(help="How far objects lie from their nominal place, cm.", min=0)] = 2.0,
+        spread: Annotated[
+            float, typer.Option(help="How far objects lie from their nominal place, cm.", min=0, max=15)
+        ] = 2.0,
         weights: Annotated[str, typer.Option(help="A name in models/weights, or a folder.")] = "lite6",
         perception: Annotated[
             Perception, typer.Option(help="Where object poses come from: cameras and tags, or the simulator itself.")
         ] = Perception.tags,
-        seed: Annotated[int, typer.Option(help="First seed; training data count up from 0.", min=0)] = 1_000_000,
+        seed: Annotated[
+            int, typer.Option(help="First seed; training data count up from 0.", min=0, max=2**62)
+        ] = 1_000_000,
         jobs: Annotated[int, typer.Option(help="Trials at a time.", min=1)] = 1,
         resume: Annotated[bool, typer.Option("--resume", help="Keep the trials already in --report.")] = False,
         report: Annotated[Path | None, typer.Option(help="Folder for trials.jsonl, one line a trial.")] = None,

@@ -4,7 +4,6 @@ same commands. What is written is what was heard on the bus.
 
 from __future__ import annotations
 
-import multiprocessing
 import random
 import tempfile
 import time
@@ -18,6 +17,7 @@ from intabs import _core, bus, messages, paths
 from intabs.data.demos import OBJECT_SLOTS, Demo, save_demos
 from intabs.demonstrate.pick_place import PickPlace
 from intabs.errors import UserError
+from intabs.jobs import in_processes
 from intabs.processes import Processes, shared_memory_name
 
 DEMONSTRATORS = {"pick_place": PickPlace}
@@ -171,6 +171,19 @@ def _demo(job: Job, r: _Recorder) -> Demo:
     )
 
 
+def _check_target(out: Path) -> None:
+    """Before the work, not after it."""
+    if out.is_dir():
+        raise UserError(f"{out} is a folder: give the name of a file, e.g. {out / 'demos.hdf5'}")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        probe = out.with_name(out.name + ".partial")
+        probe.touch()
+        probe.unlink()
+    except OSError as e:
+        raise UserError(f"cannot write {out}: {e.strerror}; give another --out") from None
+
+
 def collect(
     task: str,
     demos: int,
@@ -192,26 +205,24 @@ def collect(
     bus.require_route()
     kept: list[Demo] = []
     figures: dict = {}
-    # Processes of their own: LCM's thread does not survive a fork.
-    with multiprocessing.get_context("spawn").Pool(jobs) as pool:
-        for name in tasks:
-            good: list[Demo] = []
-            tried = 0
-            queue = (
-                Job(name, seed + i, spread, perception, disturb * (i % 5 > 0), detours * (i % 5 > 0))
-                for i in range(2 * demos + 2)
-            )
-            for demo in pool.imap(record, queue):
-                tried += 1
-                if demo.attrs["success"]:
-                    good.append(demo)
-                progress(len(kept) + len(good), f"{name}: {len(good)} of {tried} succeeded")
-                if len(good) == demos:
-                    break
-            if len(good) < demos:
-                raise UserError(f"{name}: only {len(good)} of {tried} demonstrations succeeded")
-            kept += good
-            figures[name] = {"demos": len(good), "success": len(good), "tried": tried}
-        pool.terminate()
+    _check_target(Path(out))
+    for name in tasks:
+        good: list[Demo] = []
+        tried = 0
+        queue = (
+            Job(name, seed + i, spread, perception, disturb * (i % 5 > 0), detours * (i % 5 > 0))
+            for i in range(2 * demos + 2)
+        )
+        for demo in in_processes(record, queue, jobs):
+            tried += 1
+            if demo.attrs["success"]:
+                good.append(demo)
+            progress(len(kept) + len(good), f"{name}: {len(good)} of {tried} succeeded")
+            if len(good) == demos:
+                break
+        if len(good) < demos:
+            raise UserError(f"{name}: only {len(good)} of {tried} demonstrations succeeded")
+        kept += good
+        figures[name] = {"demos": len(good), "success": len(good), "tried": tried}
     save_demos(out, kept, {"task": task, "rate_hz": 1e6 / POLICY_PERIOD_US, "embodiment": "lite6"})
     return {"demos": len(kept), "frames": sum(len(d) for d in kept), "tasks": figures}

@@ -42,7 +42,15 @@ def load_config(name_or_file: str, overrides: list[str]) -> dict:
             node = node.get(group) if isinstance(node, dict) else None
         if not sep or not isinstance(node, dict) or last not in node:
             raise UserError(f"--set {item}: no such setting; write group.name=value, e.g. train.steps=1000")
-        node[last] = yaml.safe_load(value)
+        new = yaml.safe_load(value)
+        if isinstance(node[last], float) and isinstance(new, int) and not isinstance(new, bool):
+            new = float(new)
+        if type(new) is not type(node[last]):
+            raise UserError(f"--set {item}: wants a value like {node[last]}")
+        node[last] = new
+    for key in ("steps", "batch"):
+        if config["train"][key] < 1:
+            raise UserError(f"train.{key} is {config['train'][key]}: must be 1 or more")
     return config
 
 
@@ -140,6 +148,8 @@ class Trainer:
 
         writer = SummaryWriter(str(self.run), purge_step=self.step)
         total = self.config["train"]["steps"]
+        if self.step >= total:
+            raise UserError(f"{self.run} has {self.step} steps, train.steps is {total}: nothing to do")
         valid: dict = {}
         loss_value = float("nan")
         began = time.monotonic() - self.seconds

@@ -2,6 +2,8 @@
 
 #include <catch2/catch.hpp>
 #include <limits>
+#include <memory>
+#include <optional>
 
 #include "common/alloc_hook.h"
 #include "intabs/nn/heads.h"
@@ -128,6 +130,27 @@ TEST_CASE("Reset, saved and restored states, and copies give the same outputs ag
     REQUIRE(copy->Step(X.col(t).data()) == Status::kOk);
     REQUIRE(AllHeads(net) == first[t]);
     REQUIRE(AllHeads(*copy) == first[t]);
+  }
+}
+
+TEST_CASE("A copy outlives its original, by construction and by assignment") {
+  const Eigen::MatrixXf X = Inputs(kPi.input, 5, 21);
+  auto original = std::make_unique<Network>(MakeRandomWeights(kPi, 22), "net");
+  Network other(MakeRandomWeights(kPi, 23), "net");
+  std::vector<Eigen::VectorXf> want;
+  for (int t = 0; t < 5; ++t) {
+    REQUIRE(original->Step(X.col(t).data()) == Status::kOk);
+    want.push_back(AllHeads(*original));
+  }
+  original->Reset();
+  Network constructed = *original;
+  other = *original;
+  original.reset();
+  for (int t = 0; t < 5; ++t) {
+    REQUIRE(constructed.Step(X.col(t).data()) == Status::kOk);
+    REQUIRE(other.Step(X.col(t).data()) == Status::kOk);
+    CHECK(AllHeads(constructed) == want[t]);
+    CHECK(AllHeads(other) == want[t]);
   }
 }
 

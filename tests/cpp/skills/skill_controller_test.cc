@@ -151,6 +151,7 @@ TEST_CASE("Plans that cannot be played are refused") {
   SkillController controller = MakeController();
   CHECK(controller.Start(1, {}) == Status::kOutOfRange);
   CHECK(controller.Start(1, Plan({0})) == Status::kOutOfRange);
+  CHECK(controller.Start(1, Plan({kMaxSkillTicks + 1})) == Status::kOutOfRange);
   CHECK(controller.Start(1, std::vector<Skill>(kMaxSkills + 1, Plan({1})[0])) == Status::kOutOfRange);
   std::vector<Skill> plan = Plan({1});
   plan[0].z[4] = std::numeric_limits<float>::infinity();

@@ -1,0 +1,60 @@
+"""Rollouts of the shipped weights: figures, resuming, bad input, a worker that dies."""
+
+import os
+import signal
+
+import pytest
+
+from intabs import paths
+from intabs.errors import UserError
+from intabs.jobs import in_processes
+from intabs.rollout import rollout, wilson
+
+WEIGHTS = paths.MODELS / "weights" / "lite6"
+if not (WEIGHTS / "manifest.json").exists():
+    pytest.skip(f"{WEIGHTS} is not there: train and export first", allow_module_level=True)
+
+
+def test_wilson_interval_is_the_known_one():
+    low, high = wilson(42, 50)
+    assert abs(low - 0.7149) < 1e-3 and abs(high - 0.9166) < 1e-3
+
+
+def test_a_cut_report_is_taken_up_again_as_often_as_wanted(tmp_path):
+    whole = rollout("pick_place", 3, report=tmp_path / "a")
+    path = tmp_path / "a" / "trials.jsonl"
+    path.write_bytes(path.read_bytes()[:-40])
+    for _ in range(2):
+        assert rollout("pick_place", 3, report=tmp_path / "a", resume=True) == whole
+    with pytest.raises(UserError, match="is there already"):
+        rollout("pick_place", 3, report=tmp_path / "a")
+    with pytest.raises(UserError, match="other settings"):
+        rollout("pick_place", 3, spread=1.0, report=tmp_path / "a", resume=True)
+
+
+def test_without_actions_the_task_fails_with_its_reason():
+    figures = rollout("pick_place", 1, ablate="policy")
+    assert figures["success"] == 0 and sum(figures["failures"].values()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"task": "nosuch"}, "unknown task"),
+        ({"task": "pick_place", "weights": "nosuch"}, "no such weights"),
+        ({"task": "pick_place", "spread": 1000.0}, "spread"),
+        ({"task": "pick_place", "ablate": "nosuch"}, "known are objects"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, says):
+    with pytest.raises(UserError, match=says):
+        rollout(trials=1, **arguments)
+
+
+def _die(_item):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_dies_is_said_and_not_waited_for():
+    with pytest.raises(UserError, match="worker process died"):
+        list(in_processes(_die, range(3), 1))
