@@ -4,6 +4,7 @@
 #pragma once
 
 #include <atomic>
+#include <chrono>
 #include <thread>
 #include <type_traits>
 
@@ -43,13 +44,23 @@ class SecondThread {
     state_.store(s, std::memory_order_release);
     state_.notify_one();
   }
-  // The halves take about equally long: spin for a while (tens of microseconds) before going to sleep.
+  // The halves take about equally long, and waking a thread costs more than they differ: look for a while
+  // before going to sleep.
   template <typename Condition>
   int Await(Condition condition) {
-    for (int spin = 0;; ++spin) {
+    constexpr auto kPatience = std::chrono::microseconds(500);
+    std::chrono::steady_clock::time_point start;
+    for (unsigned look = 0;; ++look) {
       const int s = state_.load(std::memory_order_acquire);
       if (condition(s)) return s;
-      if (spin >= 20000) state_.wait(s, std::memory_order_acquire);
+      if (look % 64 == 0) {
+        const auto now = std::chrono::steady_clock::now();
+        if (look == 0) start = now;
+        if (now - start > kPatience) state_.wait(s, std::memory_order_acquire);
+      }
+#if defined(__x86_64__)
+      __builtin_ia32_pause();
+#endif
     }
   }
   void Loop() {
