@@ -57,6 +57,7 @@ class SecondThread {
         const auto now = std::chrono::steady_clock::now();
         if (look == 0) start = now;
         if (now - start > kPatience) state_.wait(s, std::memory_order_acquire);
+        std::this_thread::yield();  // both may be on one CPU
       }
 #if defined(__x86_64__)
       __builtin_ia32_pause();
