@@ -247,3 +247,21 @@ def test_long_calls_release_the_gil(tmp_path):
     done.set()
     thread.join()
     assert during > 20
+
+
+@pytest.mark.parametrize("bidirectional, pool", [(False, "last"), (True, "last"), (True, "mean")])
+def test_the_networks_of_training_agree_with_their_linear_path(tmp_path, bidirectional, pool):
+    from intabs.model.networks import Recurrent
+
+    torch.manual_seed(4)
+    model = Recurrent(
+        17, 2, 40, HEADS, input_linear=24, residual=True, bidirectional=bidirectional, skip=True, pool=pool
+    )
+    net = write(tmp_path, model, {f"pi.{k}": v.numpy() for k, v in model.tensors().items()})
+    X = np.random.default_rng(1).standard_normal((60, 17)).astype(np.float32)
+    with torch.inference_mode():
+        want = model(torch.from_numpy(X)[None])
+    got = net.encode_final(X) if bidirectional else [net.step(x) for x in X]
+    for name in HEADS:
+        ours = got[name] if bidirectional else np.stack([row[name] for row in got])
+        assert np.abs(want[name][0].numpy() - ours).max() < 1e-5

@@ -44,7 +44,7 @@ Network::Network(const WeightsFile& file, const std::string& name, const Network
     head_offset_.push_back(rows);
     rows += h.size;
   }
-  RowMatrixXf weight(rows, spec_.layer_output()), bias(rows, 1);
+  RowMatrixXf weight(rows, spec_.head_input()), bias(rows, 1);
   for (int i = 0; i < num_heads(); ++i) {
     const std::string prefix = name + ".heads." + head_name(i);
     weight.middleRows(head_offset_[i], head_size(i)) = file.tensor(prefix + ".weight");
@@ -53,9 +53,8 @@ Network::Network(const WeightsFile& file, const std::string& name, const Network
   heads_.AddLinear(weight, bias);
   head_out_.resize(heads_ld());
   x_.resize(spec_.input);
-  top_.resize(spec_.layer_output());
-  scratch_.resize(kernels_->scratch_bytes(std::max(spec_.input, spec_.layer_output()), 1) / sizeof(float) +
-                  16);
+  top_.resize(spec_.head_input());
+  scratch_.resize(kernels_->scratch_bytes(std::max(spec_.input, spec_.head_input()), 1) / sizeof(float) + 16);
 }
 
 size_t Network::weight_bytes() const { return input_.bytes() + lstm_.stack().cells.bytes() + heads_.bytes(); }
@@ -91,7 +90,13 @@ Status Network::Step(const float* x) noexcept {
                           scratch_.data());
     in = linear_.data();
   }
-  Heads(lstm_.Step(in), 0, 1, head_out_.data(), scratch_.data());
+  const float* top = lstm_.Step(in);
+  if (spec_.skip) {
+    CopyColumn(top, spec_.layer_output(), top_.data());
+    CopyColumn(x, spec_.input, top_.data() + spec_.layer_output());
+    top = top_.data();
+  }
+  Heads(top, 0, 1, head_out_.data(), scratch_.data());
   return Status::kOk;
 }
 
@@ -114,20 +119,36 @@ const float* Network::Top(const Eigen::Ref<const RowMatrixXf>& X, int threads) {
   const ptrdiff_t ld = RoundUp(spec_.input, 16);
   EnsureSize(seq_x_, T * ld);
   for (int t = 0; t < T; ++t) CopyColumn(X.row(t).data(), spec_.input, seq_x_.data() + t * ld);
-  const int longest = std::max({spec_.input, spec_.lstm_input(), spec_.layer_output()});
+  const int longest = std::max({spec_.input, spec_.lstm_input(), spec_.head_input()});
   EnsureSize(seq_scratch_, kernels_->scratch_bytes(longest, T) / sizeof(float) + 16);
-  if (input_.size() == 0) return lstm_.Sequence(seq_x_.data(), ld, T, threads);
-  const ptrdiff_t ld_linear = LinearWidth(input_.cell(0));
-  EnsureSize(seq_linear_, T * ld_linear);
-  kernels_->input_gates(input_.cell(0), seq_x_.data(), ld, T, seq_linear_.data(), seq_scratch_.data());
-  return lstm_.Sequence(seq_linear_.data(), ld_linear, T, threads);
+  const float* top;
+  if (input_.size() == 0) {
+    top = lstm_.Sequence(seq_x_.data(), ld, T, threads);
+  } else {
+    const ptrdiff_t ld_linear = LinearWidth(input_.cell(0));
+    EnsureSize(seq_linear_, T * ld_linear);
+    kernels_->input_gates(input_.cell(0), seq_x_.data(), ld, T, seq_linear_.data(), seq_scratch_.data());
+    top = lstm_.Sequence(seq_linear_.data(), ld_linear, T, threads);
+  }
+  if (!spec_.skip) return top;
+  EnsureSize(seq_top_, T * head_ld());
+  for (int t = 0; t < T; ++t) {
+    float* to = seq_top_.data() + t * head_ld();
+    CopyColumn(top + t * lstm_.ld_out(), spec_.layer_output(), to);
+    CopyColumn(seq_x_.data() + t * ld, spec_.input, to + spec_.layer_output());
+  }
+  return seq_top_.data();
+}
+
+ptrdiff_t Network::head_ld() const noexcept {
+  return spec_.skip ? RoundUp(spec_.head_input(), 16) : lstm_.ld_out();
 }
 
 void Network::Sequence(const Eigen::Ref<const RowMatrixXf>& X, std::vector<RowMatrixXf>& heads, int threads) {
   const float* top = Top(X, threads);
   const int T = static_cast<int>(X.rows());
   EnsureSize(seq_heads_, T * heads_ld());
-  Heads(top, lstm_.ld_out(), T, seq_heads_.data(), seq_scratch_.data());
+  Heads(top, head_ld(), T, seq_heads_.data(), seq_scratch_.data());
   heads.resize(num_heads());
   for (int i = 0; i < num_heads(); ++i) {
     heads[i] = Eigen::Map<const RowMatrixXf, 0, Eigen::OuterStride<>>(
@@ -137,9 +158,15 @@ void Network::Sequence(const Eigen::Ref<const RowMatrixXf>& X, std::vector<RowMa
 
 void Network::EncodeFinal(const Eigen::Ref<const RowMatrixXf>& X, int threads) {
   const float* top = Top(X, threads);
-  const int H = spec_.hidden;
-  std::copy_n(top + (X.rows() - 1) * lstm_.ld_out(), H, top_.data());
-  if (spec_.bidirectional) std::copy_n(top + H, H, top_.data() + H);
+  const ptrdiff_t T = X.rows();
+  if (spec_.pool_mean) {  // heads are linear: the mean of what they read gives the mean of what they say
+    const Eigen::Map<const Eigen::MatrixXf, 0, Eigen::OuterStride<>> columns(top, spec_.head_input(), T,
+                                                                             Eigen::OuterStride<>(head_ld()));
+    Eigen::Map<Eigen::VectorXf>(top_.data(), spec_.head_input()) = columns.rowwise().mean();
+  } else {
+    std::copy_n(top + (T - 1) * head_ld(), spec_.head_input(), top_.data());
+    if (spec_.bidirectional) std::copy_n(top + spec_.hidden, spec_.hidden, top_.data() + spec_.hidden);
+  }
   Heads(top_.data(), 0, 1, head_out_.data(), scratch_.data());
 }
 
@@ -155,7 +182,8 @@ NetworkBatch::NetworkBatch(const Network& net, int n) : net_(net), lstm_(net.lst
   x_.resize(static_cast<size_t>(n) * RoundUp(net.input_size(), 16));
   if (net.input_.size() > 0) linear_.resize(n * LinearWidth(net.input_.cell(0)));
   head_out_.resize(n * net.heads_ld());
-  const int longest = std::max({net.spec().input, net.spec().lstm_input(), net.spec().layer_output()});
+  if (net.spec().skip) top_.resize(n * net.head_ld());
+  const int longest = std::max({net.spec().input, net.spec().lstm_input(), net.spec().head_input()});
   scratch_.resize(net.kernels_->scratch_bytes(longest, n) / sizeof(float) + 16);
 }
 
@@ -171,7 +199,18 @@ Status NetworkBatch::Step(const float* X) noexcept {
     in = linear_.data();
     ld = LinearWidth(net_.input_.cell(0));
   }
-  net_.Heads(lstm_.Step(in, ld), lstm_.ld_out(), size(), head_out_.data(), scratch_.data());
+  const float* top = lstm_.Step(in, ld);
+  ptrdiff_t ld_top = lstm_.ld_out();
+  if (net_.spec_.skip) {
+    for (int j = 0; j < size(); ++j) {
+      float* to = top_.data() + j * net_.head_ld();
+      CopyColumn(top + j * ld_top, net_.spec_.layer_output(), to);
+      CopyColumn(X + static_cast<ptrdiff_t>(j) * inputs, inputs, to + net_.spec_.layer_output());
+    }
+    top = top_.data();
+    ld_top = net_.head_ld();
+  }
+  net_.Heads(top, ld_top, size(), head_out_.data(), scratch_.data());
   return Status::kOk;
 }
 

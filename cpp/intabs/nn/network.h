@@ -64,15 +64,17 @@ class Network {
   // threads = 2: one a direction of a bidirectional network. No allocation once T has been as large before
   // (and the second thread, and `heads`, are there).
   void Sequence(const Eigen::Ref<const RowMatrixXf>& X, std::vector<RowMatrixXf>& heads, int threads = 1);
-  // For encoders: Head(i) afterwards is head i on the top layer's [forward output at T-1, backward output at
-  // 0], or on its output at T-1 if not bidirectional. (With `residual` the output includes the residual
-  // path.)
+  // For encoders: Head(i) afterwards is, with pool "mean", the mean over the ticks of what Sequence gives; else
+  // head i on the top layer's [forward output at T-1, backward output at 0], or on its output at T-1 if not
+  // bidirectional (with `skip`, beside the input at T-1). With `residual` the output includes the residual path.
   void EncodeFinal(const Eigen::Ref<const RowMatrixXf>& X, int threads = 1);
 
  private:
   friend class NetworkBatch;
 
-  const float* Top(const Eigen::Ref<const RowMatrixXf>& X, int threads);  // T columns of layer_output()
+  // What the heads read: T columns of head_input(), head_ld() apart.
+  const float* Top(const Eigen::Ref<const RowMatrixXf>& X, int threads);
+  ptrdiff_t head_ld() const noexcept;
   void Heads(const float* top, ptrdiff_t ld, int n, float* out, void* scratch) const noexcept;
   ptrdiff_t heads_ld() const noexcept;
 
@@ -84,7 +86,7 @@ class Network {
   PackedCells heads_;  // one: all heads below each other
   std::vector<int> head_offset_;
   AlignedFloats x_, linear_, head_out_, top_, scratch_;
-  AlignedFloats seq_x_, seq_linear_, seq_heads_, seq_scratch_;
+  AlignedFloats seq_x_, seq_linear_, seq_top_, seq_heads_, seq_scratch_;
 };
 
 // n copies of a network's state that step together, for planning: one set of weights (its own copy), which
@@ -109,7 +111,7 @@ class NetworkBatch {
  private:
   Network net_;
   LstmBatch lstm_;
-  AlignedFloats x_, linear_, head_out_, scratch_;
+  AlignedFloats x_, linear_, top_, head_out_, scratch_;
 };
 
 }  // namespace intabs

@@ -46,7 +46,10 @@ class ReferenceNetwork {
       for (int t = 0; t < X.rows(); ++t) lstm_->Step(in.row(t).data(), top.row(t).data());
     }
     heads.clear();
-    for (const auto& head : heads_) heads.push_back(Map(head, top));
+    Rows read(X.rows(), spec_.head_input());
+    read.leftCols(spec_.layer_output()) = top;
+    if (spec_.skip) read.rightCols(spec_.input) = X;
+    for (const auto& head : heads_) heads.push_back(Map(head, read));
     return top;
   }
 

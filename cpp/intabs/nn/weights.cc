@@ -145,7 +145,7 @@ std::vector<Wanted> WantedTensors(const std::string& net, const NetworkSpec& s) 
     out.push_back({prefix + "bias", s.layer_input(l)});
   }
   for (const HeadSpec& h : s.heads) {
-    out.push_back({net + ".heads." + h.name + ".weight", h.size, s.layer_output()});
+    out.push_back({net + ".heads." + h.name + ".weight", h.size, s.head_input()});
     out.push_back({net + ".heads." + h.name + ".bias", h.size});
   }
   return out;
@@ -213,14 +213,19 @@ Manifest Manifest::Parse(std::string_view text, const std::string& label) {
     s.residual = boolean("residual");
     s.bidirectional = boolean("bidirectional");
     s.layer_norm = boolean("layer_norm");
+    s.skip = boolean("skip");
+    if (const auto pool = entry.find("pool"); pool != entry.end()) {
+      if (*pool != "mean" && *pool != "last") m.Fail(where + ": \"pool\" must be \"mean\" or \"last\"");
+      s.pool_mean = *pool == "mean";
+    }
     if (const auto format = entry.find("format"); format != entry.end()) {
       if (!format->is_string()) m.Fail(where + ": \"format\" must be \"fp32\", \"16\" or \"8\"");
       s.format = ParseWeightFormat(format->get<std::string>());
     }
     for (const auto& [key, value] : entry.items()) {
-      static const std::set<std::string> known = {"input",      "input_linear", "layers",
-                                                  "hidden",     "residual",     "bidirectional",
-                                                  "layer_norm", "format",       "heads"};
+      static const std::set<std::string> known = {"input",      "input_linear", "layers", "hidden",
+                                                  "residual",   "bidirectional", "layer_norm", "skip",
+                                                  "pool",       "format",        "heads"};
       if (!known.contains(key)) m.Fail(where + ": unknown key " + Quoted(key));
     }
     const auto heads = entry.find("heads");

@@ -6,10 +6,11 @@
 //   {"schema_version": 1,
 //    "sha256": "<of weights.safetensors>",
 //    "networks": {"pi": {"input": 40, "input_linear": 128, "layers": 8, "hidden": 128, "residual": true,
-//                        "bidirectional": false, "layer_norm": false, "format": "fp32",
+//                        "bidirectional": false, "layer_norm": false, "skip": false,
+//                        "pool": "last", "format": "fp32",
 //                        "heads": {"agent_mean": 7, "env_mean": 12}}}}
 // format: "fp32", "16" or "8", how the network runs unless the caller says otherwise. All but input, layers,
-// hidden and heads may be left out (0, false, fp32). Other keys belong to other rooms, which read them
+// hidden and heads may be left out (0, false, last, fp32). Other keys belong to other rooms, which read them
 // through Manifest.
 //
 // Tensors of network N, torch's names and layout, gates i, f, g, o:
@@ -17,7 +18,7 @@
 //   N.lstm.L.weight_ih (4 hidden, in), .weight_hh (4 hidden, hidden), .bias_ih, .bias_hh (4 hidden)
 //     and the same with _reverse for a bidirectional one; in = 2 hidden for its layers >= 1
 //   N.lstm.L.norm.weight, .bias (in), L >= 1: only with layer_norm
-//   N.heads.HEAD.weight (size, hidden or 2 hidden), .bias
+//   N.heads.HEAD.weight (size, hidden or 2 hidden, with skip + input), .bias
 #pragma once
 
 #include <Eigen/Core>
@@ -54,11 +55,14 @@ struct NetworkSpec {
   bool residual = false;
   bool bidirectional = false;
   bool layer_norm = false;  // layer >= 1 reads norm(its input); the residual path goes past the norm
+  bool skip = false;        // heads read [top layer's output, the network's input]: a linear path beside the LSTM
+  bool pool_mean = false;   // "pool": "mean" or "last": what EncodeFinal takes of the heads over a sequence
   WeightFormat format = WeightFormat::kFp32;
   std::vector<HeadSpec> heads;  // in the order of their names
 
   int lstm_input() const { return input_linear > 0 ? input_linear : input; }
   int layer_output() const { return bidirectional ? 2 * hidden : hidden; }
+  int head_input() const { return layer_output() + (skip ? input : 0); }
   int layer_input(int layer) const { return layer == 0 ? lstm_input() : layer_output(); }
 };
 

@@ -19,7 +19,9 @@ class Recurrent(nn.Module):
     """Linear input layer, stacked LSTM with optional residual connections, named linear heads.
 
     Residual: layer l >= 1 hands on h_l + x_l; its own recurrent state stays h_l.
-    Bidirectional: heads see [forward half at the last tick, backward half at the first] of the last layer.
+    Skip: heads see [top layer, network's input], a linear path beside the LSTMs.
+    Bidirectional: heads give one value a sequence: of [forward half at the last tick, backward half at the first] of the
+    top layer, or with pool "mean" their mean over the ticks.
     """
 
     def __init__(
@@ -31,6 +33,8 @@ class Recurrent(nn.Module):
         input_linear: int = 0,
         residual: bool = False,
         bidirectional: bool = False,
+        skip: bool = False,
+        pool: str = "last",
     ):
         super().__init__()
         self.spec = {
@@ -40,10 +44,13 @@ class Recurrent(nn.Module):
             "hidden": hidden,
             "residual": residual,
             "bidirectional": bidirectional,
+            "skip": skip,
+            "pool": pool,
             "heads": dict(heads),
         }
         self.residual = residual
         self.bidirectional = bidirectional
+        self.skip, self.pool = skip, pool
         self.input = nn.Linear(inputs, input_linear) if input_linear else nn.Identity()
         first = input_linear or inputs
         width = hidden * (2 if bidirectional else 1)
@@ -51,7 +58,8 @@ class Recurrent(nn.Module):
             nn.LSTM(first if i == 0 else width, hidden, batch_first=True, bidirectional=bidirectional)
             for i in range(layers)
         )
-        self.heads = nn.ModuleDict({k: nn.Linear(width, n) for k, n in heads.items()})
+        read = width + (inputs if skip else 0)
+        self.heads = nn.ModuleDict({k: nn.Linear(read, n) for k, n in heads.items()})
         for lstm in self.lstm:
             for suffix in ("", "_reverse") if bidirectional else ("",):
                 weight_hh = getattr(lstm, f"weight_hh_l0{suffix}")
@@ -64,13 +72,17 @@ class Recurrent(nn.Module):
 
     def forward(self, x: Tensor) -> dict[str, Tensor]:
         """x (B, T, inputs). Causal: heads at every tick, (B, T, n). Bidirectional: one value a sequence, (B, n)."""
-        x = self.input(x)
+        seen, x = x, self.input(x)
         for i, lstm in enumerate(self.lstm):
             h, _ = lstm(x)
             x = h + x if self.residual and i > 0 else h
-        if self.bidirectional:
+        if self.bidirectional and self.pool == "last":
             hidden = self.spec["hidden"]
-            x = torch.cat([x[:, -1, :hidden], x[:, 0, hidden:]], dim=-1)
+            x, seen = torch.cat([x[:, -1, :hidden], x[:, 0, hidden:]], dim=-1), seen[:, -1]
+        if self.skip:
+            x = torch.cat([x, seen], -1)
+        if self.bidirectional and self.pool == "mean":
+            x = x.mean(1)
         return {k: head(x) for k, head in self.heads.items()}
 
     def tensors(self) -> dict[str, Tensor]:

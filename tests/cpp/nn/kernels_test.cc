@@ -170,6 +170,7 @@ TEST_CASE("Step and Sequence of every path agree with Eigen in double") {
                              .hidden = s.hidden,
                              .residual = s.residual,
                              .layer_norm = s.layer_norm,
+                             .skip = k % 2 == 1,
                              .heads = {{"a", 70}, {"b", 1}}};
       const WeightsFile w =
           MakeWeights({{"net", spec}}, Representable(RandomNetwork("net", spec, 100 + k, 2), format));
@@ -202,6 +203,7 @@ TEST_CASE(
                              .residual = true,
                              .bidirectional = true,
                              .layer_norm = norm,
+                             .skip = norm,
                              .heads = {{"a", 3}}};
       const WeightsFile w =
           MakeWeights({{"net", spec}}, Representable(RandomNetwork("net", spec, 5, 2), format));
@@ -230,6 +232,7 @@ TEST_CASE("A batch of every path agrees with Eigen in double, each rollout with 
                          .hidden = 48,
                          .residual = true,
                          .layer_norm = true,
+                         .skip = true,
                          .heads = {{"a", 7}, {"b", 2}}};
   for (const WeightFormat format : {WeightFormat::kFp32, WeightFormat::k16, WeightFormat::k8}) {
     const WeightsFile w =

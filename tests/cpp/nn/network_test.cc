@@ -171,6 +171,24 @@ TEST_CASE("An input that is not finite is refused and changes nothing") {
   CHECK(AllHeads(net) == heads);
 }
 
+TEST_CASE("With pool \"mean\" EncodeFinal is the mean over the ticks of what Sequence gives") {
+  for (const bool skip : {false, true}) {
+    NetworkSpec s = kPi;
+    s.bidirectional = true;
+    s.pool_mean = true;
+    s.skip = skip;
+    Network net(MakeRandomWeights(s, 11), "net");
+    const RowMatrixXf X = Inputs(s.input, 23, 4).transpose();
+    std::vector<RowMatrixXf> heads;
+    net.Sequence(X, heads);
+    net.EncodeFinal(X);
+    for (int i = 0; i < net.num_heads(); ++i) {
+      CHECK((net.Head(i).transpose() - heads[i].colwise().mean()).cwiseAbs().maxCoeff() < 1e-6f);
+      CHECK((net.Head(i).transpose() - heads[i].row(22)).cwiseAbs().maxCoeff() > 1e-4f);
+    }
+  }
+}
+
 TEST_CASE("A bidirectional network has no tick, and a sequence of a wrong width is refused") {
   NetworkSpec s = kPi;
   s.bidirectional = true;
@@ -203,6 +221,7 @@ TEST_CASE("Neither Step nor Reset nor the state allocates, in any weight format"
   NetworkSpec s = kPi;
   s.layers = 8;
   s.hidden = s.input_linear = 128;
+  s.skip = true;
   const WeightsFile w = MakeRandomWeights(s, 14);
   const Eigen::MatrixXf X = Inputs(s.input, 20, 15);
   for (const WeightFormat format : {WeightFormat::kFp32, WeightFormat::k16, WeightFormat::k8}) {
@@ -234,7 +253,7 @@ TEST_CASE("Sequence after warm-up and Batch do not allocate, in any weight forma
     for (const bool bidirectional : {false, true}) {
       NetworkSpec s = kPi;
       s.bidirectional = bidirectional;
-      s.layer_norm = true;
+      s.layer_norm = s.skip = s.pool_mean = true;
       Network net(MakeRandomWeights(s, 16), "net", {.format = format});
       const RowMatrixXf X = Inputs(300, s.input, 17);
       std::vector<RowMatrixXf> heads;

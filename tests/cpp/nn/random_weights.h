@@ -58,7 +58,7 @@ inline RawTensors RandomNetwork(const std::string& net, const NetworkSpec& s, un
     out[prefix + "bias"] = RandomTensor({s.layer_input(l)}, 1, rng);
   }
   for (const HeadSpec& h : s.heads) {
-    out[net + ".heads." + h.name + ".weight"] = RandomTensor({h.size, s.layer_output()}, bound, rng);
+    out[net + ".heads." + h.name + ".weight"] = RandomTensor({h.size, s.head_input()}, bound, rng);
     out[net + ".heads." + h.name + ".bias"] = RandomTensor({h.size}, bound, rng);
   }
   return out;
@@ -97,7 +97,8 @@ inline std::string ManifestText(const std::map<std::string, NetworkSpec>& networ
            ",\"input_linear\":" + std::to_string(s.input_linear) + ",\"layers\":" + std::to_string(s.layers) +
            ",\"hidden\":" + std::to_string(s.hidden) + ",\"residual\":" + (s.residual ? "true" : "false") +
            ",\"bidirectional\":" + (s.bidirectional ? "true" : "false") +
-           ",\"layer_norm\":" + (s.layer_norm ? "true" : "false") + ",\"format\":\"" +
+           ",\"layer_norm\":" + (s.layer_norm ? "true" : "false") + ",\"skip\":" + (s.skip ? "true" : "false") +
+           ",\"pool\":\"" + (s.pool_mean ? "mean" : "last") + "\",\"format\":\"" +
            (s.format == WeightFormat::kFp32 ? "fp32"
             : s.format == WeightFormat::k16 ? "16"
                                             : "8") +
