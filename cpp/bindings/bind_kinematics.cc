@@ -38,6 +38,15 @@ void Bind_kinematics(py::module_& m) {
       .def("jacobian", &ArmModel::Jacobian, "q"_a,
            "(6, 6): linear [m/s], then angular [rad/s] velocity of the tip in the base, by joint velocity.")
       .def_property_readonly(
+          "frames",
+          [](const ArmModel& arm) {
+            Eigen::Matrix<double, kNumJoints + 1, 7, Eigen::RowMajor> frames;
+            for (int i = 0; i < kNumJoints; ++i) frames.row(i) = ToArray(arm.parameters().X_PJ[i]);
+            frames.row(kNumJoints) = ToArray(arm.parameters().X_EG);
+            return frames;
+          },
+          "(7, 7): the frame of each joint, at q = 0, in the link before it; last the tip in the flange.")
+      .def_property_readonly(
           "q_min", [](const ArmModel& arm) { return arm.q_min(); }, "Lower joint limits (6,) in rad.")
       .def_property_readonly(
           "q_max", [](const ArmModel& arm) { return arm.q_max(); }, "Upper joint limits (6,) in rad.");

@@ -20,8 +20,8 @@ class Recurrent(nn.Module):
 
     Residual: layer l >= 1 hands on h_l + x_l; its own recurrent state stays h_l.
     Skip: heads see [top layer, network's input], a linear path beside the LSTMs.
-    Bidirectional: heads give one value a sequence: of [forward half at the last tick, backward half at the first] of the
-    top layer, or with pool "mean" their mean over the ticks.
+    Bidirectional: heads give one value a sequence: of [forward half at the last tick, backward half at the first] of
+    the top layer, or with pool "mean" their mean over the ticks.
     """
 
     def __init__(
@@ -85,6 +85,19 @@ class Recurrent(nn.Module):
             x = x.mean(1)
         return {k: head(x) for k, head in self.heads.items()}
 
+    def step(self, x: Tensor, memory: list | None = None) -> tuple[dict[str, Tensor], list]:
+        """One tick of a causal network, x (B, inputs); memory None: zero state. Heads (B, n), and the new memory."""
+        seen, x, carried = x, self.input(x), []
+        for i, lstm in enumerate(self.lstm):
+            weights = (lstm.weight_ih_l0, lstm.weight_hh_l0, lstm.bias_ih_l0, lstm.bias_hh_l0)
+            before = memory[i] if memory else (x.new_zeros(len(x), lstm.hidden_size),) * 2
+            h, c = torch.lstm_cell(x, before, *weights)
+            carried.append((h, c))
+            x = h + x if self.residual and i > 0 else h
+        if self.skip:
+            x = torch.cat([x, seen], -1)
+        return {k: head(x) for k, head in self.heads.items()}, carried
+
     def tensors(self) -> dict[str, Tensor]:
         """Names and values as the C++ side reads them."""
         out = {}
@@ -127,6 +140,12 @@ class InteractionAbstractions(nn.Module):
         """state (B, T, 59), z (B, 16) held over the segment -> a^r (B, T, 7), a^e (B, T, 24). From zero state."""
         y = self.pi(torch.cat([state, z[:, None].expand(-1, state.shape[1], -1)], -1))
         return y["agent"], y["environment"]
+
+    def load_tensors(self, tensors: dict[str, Tensor]) -> None:
+        """Weights as exported, named NETWORK.TENSOR."""
+        for net, module in self.networks().items():
+            for name, value in module.tensors().items():
+                value.copy_(tensors[f"{net}.{name}"])  # a detached view of the parameter
 
     def networks(self) -> dict[str, Recurrent]:
         return {"pi": self.pi, "q_agent": self.q_agent, "q_environment": self.q_environment}

@@ -1,0 +1,142 @@
+"""What the learned skills are held against. Each takes a motion and the ticks at which it is cut, and gives back what
+its own description of the pieces, chained from the first state, says."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intabs.evaluate.metrics import Motion, Scaling, joined
+from intabs.model.kinematics import log_so3
+
+
+class Method(Protocol):
+    name: str
+
+    def reconstruct(self, motion: Motion, cuts: list[int]) -> Motion:
+        """Cuts: first 0, last len(motion) - 1. The answer's first state is the motion's."""
+
+
+class Still:
+    """Stays where it begins."""
+
+    name = "still"
+
+    def reconstruct(self, motion: Motion, cuts: list[int]) -> Motion:
+        return motion[np.zeros(len(motion), int)]
+
+
+# --- displacements: what PCA and the mean describe --------------------------------------------------------------------
+class Displacement:
+    """A motion as displacement from its start, resampled to N ticks, in normalised units: agent (N A,), environment
+    (N (3 S + E + 3 S),): positions and rotation vectors / pi of the objects, and environment scalars."""
+
+    N = 12
+
+    def __init__(self, scaling: Scaling):
+        self.scaling = scaling
+
+    def _unit(self, spread: np.ndarray) -> np.ndarray:
+        return np.where(spread > 0, spread, 1.0)
+
+    def split(self, m: Motion) -> tuple[np.ndarray, np.ndarray]:
+        s = self.scaling
+        steps = len(m)
+        agent = (m.agent - m.agent[0]) / self._unit(s.agent) * (s.agent > 0)
+        p = ((m.p - m.p[:1]) / self._unit(s.p) * (s.p > 0)).reshape(steps, -1)
+        e = (m.environment - m.environment[0]) / self._unit(s.environment) * (s.environment > 0)
+        w = log_so3(m.R @ np.swapaxes(m.R[:1], -1, -2)).reshape(steps, -1) / np.pi if m.R.shape[1] else p
+        return self._resampled(agent), self._resampled(np.concatenate([p, e, w], 1))
+
+    def _resampled(self, x: np.ndarray) -> np.ndarray:
+        at = np.linspace(0, len(x) - 1, self.N + 1)[1:]
+        return np.stack([np.interp(at, np.arange(len(x)), column) for column in x.T], 1).ravel() if x.shape[1] else x[0]
+
+    def joined(self, start: Motion, agent: np.ndarray, environment: np.ndarray, steps: int) -> Motion:
+        """The inverse, `steps` ticks with the start as the first."""
+        s = self.scaling
+        a = self._stretched(agent, start.agent.shape[1], steps) * s.agent
+        slots, scalars = start.p.shape[1], start.environment.shape[1]
+        e = self._stretched(environment, 6 * slots + scalars, steps)
+        p = e[:, : 3 * slots].reshape(steps, slots, 3) * s.p
+        w = e[:, 3 * slots + scalars :].reshape(-1, 3) * np.pi
+        turn = Rotation.from_rotvec(w).as_matrix().reshape(steps, slots, 3, 3) if slots else start.R[[0] * steps]
+        return Motion(
+            start.agent[:1] + a,
+            start.p[:1] + p,
+            turn @ start.R[:1],
+            start.environment[:1] + e[:, 3 * slots : 3 * slots + scalars] * s.environment,
+            np.repeat(start.valid[:1], steps, 0),
+        )
+
+    def _stretched(self, flat: np.ndarray, width: int, steps: int) -> np.ndarray:
+        x = np.concatenate([np.zeros((1, width)), flat.reshape(self.N, width)])
+        at = np.linspace(0, self.N, steps)
+        return np.stack([np.interp(at, np.arange(self.N + 1), c) for c in x.T], 1) if width else np.zeros((steps, 0))
+
+
+def chained(motion: Motion, cuts: list[int], piece) -> Motion:
+    """piece(start, segment, steps) -> Motion of `steps` ticks from `start`; each begins where the last one ended."""
+    out = [motion[:1]]
+    for a, b in zip(cuts, cuts[1:], strict=False):
+        out.append(piece(out[-1][-1:], motion[a : b + 1], b - a + 1)[1:])
+    return joined(out)
+
+
+def training_pieces(motions: list[Motion], segment: int, stride: int = 2) -> list[Motion]:
+    return [
+        m[a : a + n]
+        for m in motions
+        for n in (segment - 2, segment, segment + 2)
+        for a in range(0, len(m) - n + 1, stride)
+    ]
+
+
+class Pca:
+    """Principal components of the segments' displacement, agent and environment apart, as many numbers as z."""
+
+    name = "pca"
+
+    def __init__(self, train: list[Motion], scaling: Scaling, segment: int, agent: int = 8, environment: int = 8):
+        self.shape = Displacement(scaling)
+        rows = [self.shape.split(m) for m in training_pieces(train, segment)]
+        self.parts = []
+        for x, k in zip(
+            (np.array([r[0] for r in rows]), np.array([r[1] for r in rows])), (agent, environment), strict=True
+        ):
+            mean = x.mean(0)
+            _, _, components = np.linalg.svd(x - mean, full_matrices=False) if x.shape[1] else (0, 0, x[:0])
+            self.parts.append((mean, components[:k]))
+
+    def encode(self, segment: Motion) -> np.ndarray:
+        """(16,) or fewer numbers."""
+        return np.concatenate([U @ (x - m) for x, (m, U) in zip(self.shape.split(segment), self.parts, strict=True)])
+
+    def reconstruct(self, motion: Motion, cuts: list[int]) -> Motion:
+        def piece(start: Motion, segment: Motion, steps: int) -> Motion:
+            back = [m + (U @ (x - m)) @ U for x, (m, U) in zip(self.shape.split(segment), self.parts, strict=True)]
+            return self.shape.joined(start, *back, steps)
+
+        return chained(motion, cuts, piece)
+
+
+class Mean:
+    """The mean displacement of the training split: of whole demonstrations, or of segments."""
+
+    name = "mean"
+
+    def __init__(self, train: list[Motion], scaling: Scaling, segment: int):
+        self.shape = Displacement(scaling)
+        self.segment = self._mean(training_pieces(train, segment))
+        self.shape.N = 60
+        self.whole = self._mean(train)
+
+    def _mean(self, motions: list[Motion]) -> tuple[int, np.ndarray, np.ndarray]:
+        rows = [self.shape.split(m) for m in motions]
+        return self.shape.N, np.mean([r[0] for r in rows], 0), np.mean([r[1] for r in rows], 0)
+
+    def reconstruct(self, motion: Motion, cuts: list[int]) -> Motion:
+        self.shape.N, agent, environment = self.segment if len(cuts) == 2 else self.whole
+        return self.shape.joined(motion[:1], agent, environment, len(motion))

@@ -1,0 +1,102 @@
+"""What the C++ side computes from readings (skills/state.h, kinematics/arm_model.h), once more in torch: a kinematic
+rollout is trained through, so that it needs gradients. tests/python/test_kinematics.py holds the two together.
+
+Rotations are matrices R (..., 3, 3); positions p (..., 3) in m.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+NEAR = 0.01  # m, kNear of skills/state.h
+
+
+def rotation(quaternion: np.ndarray) -> np.ndarray:
+    """(..., 4) wxyz, any norm but 0 -> (..., 3, 3). Zeros (unused slots) give the identity."""
+    q = np.asarray(quaternion, "f8")
+    norm = np.linalg.norm(q, axis=-1, keepdims=True)
+    q = np.where(norm > 0, q / np.maximum(norm, 1e-12), [1.0, 0.0, 0.0, 0.0])
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
+
+
+def cross_matrix(w: Tensor) -> Tensor:
+    """(..., 3) -> (..., 3, 3), [w]x."""
+    x, y, z = w.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3))
+
+
+def exp_so3(w: Tensor) -> Tensor:
+    """Rodrigues' formula, smooth at 0. (..., 3) rad -> (..., 3, 3)."""
+    square = (w * w).sum(-1)[..., None, None]
+    angle = (square + 1e-12).sqrt()
+    K = cross_matrix(w)
+    one = torch.eye(3, dtype=w.dtype, device=w.device)
+    return one + torch.sin(angle) / angle * K + (1 - torch.cos(angle)) / (square + 1e-12) * (K @ K)
+
+
+def log_so3(R: np.ndarray) -> np.ndarray:
+    """(..., 3, 3) -> (..., 3) rotation vectors, angle at most pi."""
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(*R.shape[:-2], 3)
+
+
+def angle_between(A: Tensor, B: Tensor) -> Tensor:
+    """Geodesic angle [rad] of two rotations, by the chord |A - B|_F = 2 sqrt(2) sin(angle / 2): exact, and with a
+    gradient near 0 that the arc cosine of the trace does not have."""
+    chord = ((A - B) ** 2).sum((-1, -2))
+    return 2 * torch.asin((chord / 8 + 1e-12).sqrt().clamp(max=1 - 1e-6))
+
+
+class Arm(torch.nn.Module):
+    """Forward kinematics of the tip G in the base. arm: intabs._core.ArmModel."""
+
+    def __init__(self, arm):
+        super().__init__()
+        frames = np.asarray(arm.frames)
+        self.register_buffer("p", torch.tensor(frames[:, :3], dtype=torch.float32), persistent=False)
+        self.register_buffer("R", torch.tensor(rotation(frames[:, 3:]), dtype=torch.float32), persistent=False)
+
+    def tip(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """q (..., 6) -> p_WG (..., 3), R_WG (..., 3, 3)."""
+        c, s = torch.cos(q)[..., None], torch.sin(q)[..., None]
+        p, R = None, None
+        for i in range(q.shape[-1]):
+            if R is None:
+                p, R = self.p[i].expand(*q.shape[:-1], 3), self.R[i].expand(*q.shape[:-1], 3, 3)
+            else:
+                p = p + R @ self.p[i]
+                R = R @ self.R[i]
+            x, y, z = R.unbind(-1)
+            R = torch.stack([c[..., i, :] * x + s[..., i, :] * y, c[..., i, :] * y - s[..., i, :] * x, z], -1)
+        return p + R @ self.p[-1], R @ self.R[-1]
+
+
+def state_features(
+    arm: Arm, q: Tensor, gripper: Tensor, p_WO: Tensor, R_WO: Tensor, known: Tensor, valid: Tensor
+) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+    """AssembleState. q (..., 6), gripper (...) +-1, p_WO (..., 4, 3), R_WO (..., 4, 3, 3), known and valid (..., 4), 0
+    or 1 -> s (..., 59), not normalised, and the tip (p_WG, R_WG)."""
+    p_WG, R_WG = arm.tip(q)
+    R_GW = R_WG.transpose(-1, -2)[..., None, :, :]
+    p = (R_GW @ (p_WO - p_WG[..., None, :])[..., None])[..., 0]
+    R = R_GW @ R_WO
+    columns = torch.cat([R[..., 0], R[..., 1]], -1)
+    objects = torch.cat([p, columns, valid[..., None], p / (NEAR + p.abs())], -1) * known[..., None]
+    return torch.cat([q, gripper[..., None], objects.flatten(-2)], -1), (p_WG, R_WG)
+
+
+def move_objects(p_WO: Tensor, R_WO: Tensor, R_WG: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:
+    """The inverse of ObjectMotion: motion (..., 4, 6) in the tip's frame moves the poses on by one tick."""
+    R = R_WG[..., None, :, :]
+    p = p_WO + (R @ motion[..., :3, None])[..., 0]
+    return p, exp_so3((R @ motion[..., 3:, None])[..., 0]) @ R_WO
