@@ -4,6 +4,7 @@
 #include <pybind11/stl.h>
 
 #include "intabs/plant/renderer.h"
+#include "intabs/plant/task.h"
 #include "intabs/plant/world.h"
 
 namespace py = pybind11;
@@ -50,11 +51,38 @@ void Bind_plant(py::module_& m) {
             return d;
           },
           "{id: p_WO [m] and q_WO wxyz (7,)}: the truth.")
+      .def(
+          "contacts",
+          [](const World& w) {
+            const Contacts c = w.Touches();
+            py::dict d;
+            for (int slot = 0; slot < kMaxObjects; ++slot) {
+              const TrackedObject o = w.Objects()[slot];
+              if (o.id < 0) continue;
+              const uint8_t bits = c.touches[slot];
+              py::list touched;
+              for (int other = 0; other < kMaxObjects; ++other) {
+                if (bits >> other & 1) touched.append(w.Objects()[other].id);
+              }
+              py::dict one;
+              one["fingers"] = py::make_tuple((bits & kTouchesLeftFinger) != 0, (bits & kTouchesRightFinger) != 0);
+              one["arm"] = (bits & kTouchesArm) != 0;
+              one["scene"] = (bits & kTouchesScene) != 0;
+              one["objects"] = touched;
+              one["beads"] = c.beads_in[slot];
+              d[py::int_(o.id)] = one;
+            }
+            return d;
+          },
+          "{id: {fingers: (left, right), arm: another part of it, scene: table or furniture, objects: [ids],\n"
+          "beads: inside this vessel}}: whom each object touches.")
       .def_property_readonly("success", &World::Success)
       .def_property_readonly("subgoals", &World::Subgoals)
       .def_property_readonly("subgoal_names", &World::SubgoalNames)
       .def_property_readonly("failure_reason", &World::FailureReason)
       .def_property_readonly("state_hash", &World::StateHash);
+
+  m.def("task_names", [] { return TaskNames(); }, "What World knows: tasks, then compositions.");
 
   py::class_<Renderer>(m, "Renderer", "Pictures of a World without a window.")
       .def(py::init<const World&, int, int>(), py::arg("world"), py::arg("width") = 640, py::arg("height") = 480)

@@ -36,13 +36,7 @@ int Main(int argc, char** argv) {
   app.add_option("--strip", o.strip, "write a strip of pictures of the run, FILE.png");
   app.add_flag("--viewer", o.viewer, "open a window");
   app.add_option("--json", o.json, "write the figures there at the end");
-  try {
-    app.parse(argc, argv);
-  } catch (const CLI::ParseError& e) {
-    if (e.get_exit_code() == 0) return app.exit(e);
-    std::cerr << "intabs_plant: " << e.what() << " (see --help)\n";
-    return 1;
-  }
+  if (const auto code = ParseCommandLine(app, "intabs_plant", argc, argv)) return *code;
   InstallStopSignals();
   try {
     Plant plant(o);

@@ -154,8 +154,17 @@ void Plant::OnCommand(const ArmCommand& c) {
     return;
   }
   answer_ = Answer::kGiven;
+  answered_us_ = MonotonicUs();
   last_session_ = c.session;
   last_seq_ = c.seq;
+}
+
+// A session that only holds does not mind a reset. In lockstep time stands still with one that died: its arm moves
+// for ever, but nobody answers any more.
+bool Plant::Moves() const {
+  const ArmState state = sim_.controller().state();
+  const bool alive = !Lockstep() || MonotonicUs() - answered_us_ < kStrangerUs;
+  return alive && (state == ArmState::kTracking || state == ArmState::kSlowing);
 }
 
 void Plant::OnStatus(const ArmStatus& s) { heard_other_ |= s.source != source_; }
@@ -168,8 +177,8 @@ void Plant::OnControl(const PlantControl& c) {
     reason = "it runs another task: start another plant";
   } else if (state == ArmState::kFault || state == ArmState::kStopped) {
     reason = "the arm is in fault or stopped: send RESET first";
-  } else if (sim_.controller().Busy(NowUs())) {
-    reason = "a session runs";
+  } else if (Moves()) {
+    reason = "a session moves the arm";
   } else if (!(c.spread >= 0 && c.spread <= World::kMaxSpread)) {
     reason = "the spread must be 0 to 15 cm";
   }

@@ -35,6 +35,7 @@ class Plant {
   void OnControl(const PlantControl& control);
   void Handle(int timeout_ms);
 
+  bool Moves() const;
   bool Lockstep() const { return options_.clock == "lockstep"; }
   int64_t NowUs() const;
   void StartOver(int64_t seed, double spread_cm);
@@ -56,6 +57,7 @@ class Plant {
   bool heard_other_ = false;
   bool started_over_ = false;
   Answer answer_ = Answer::kNone;
+  int64_t answered_us_ = 0;                   // when, of the host's clock
   int64_t last_session_ = 0, last_seq_ = -1;  // of the command that was answered last
 
   int64_t status_seq_base_ = 0;  // seq goes on over resets

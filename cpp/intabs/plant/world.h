@@ -29,6 +29,13 @@ struct ArmMeasurement {
   double gripper_opening;  // both fingers together [m]
 };
 
+// Whom the objects touch, by slot, as in PlantTruth (core/types.h).
+struct Contacts {
+  std::array<uint8_t, kMaxObjects> touches{};
+  std::array<int16_t, kMaxObjects> beads_in{};  // inside this vessel
+  int16_t beads = 0;                            // in the world
+};
+
 // What rendering needs of a state; reused without allocation.
 struct Snapshot {
   double time = 0;
@@ -46,7 +53,8 @@ class World {
   World& operator=(const World&) = delete;
 
   // Time zero, arm at home with open gripper, each object uniform in a disc of `spread_cm` about its nominal
-  // place, yaw uniform within 3 degrees per cm (30 at most). Throws if spread_cm is not within 0 .. kMaxSpread.
+  // place, yaw uniform within 3 degrees per cm (30 at most); fixed furniture too; beads at rest in their vessel.
+  // Throws if spread_cm is not within 0 .. kMaxSpread.
   void Reset(int64_t seed, double spread_cm);
 
   // One driver tick: 4 ms, gravity compensated servos. Throws when the target is not finite or the
@@ -56,27 +64,34 @@ class World {
   int64_t time_us() const;
   ArmMeasurement Arm() const;
   std::array<TrackedObject, kMaxObjects> Objects() const;  // the truth: valid, no covariance, age 0
+  Contacts Touches() const;
 
   std::vector<std::string> SubgoalNames() const;
   uint32_t Subgoals() const;  // those that hold now
   bool Success() const;
   std::string FailureReason() const;  // empty when it is a success
-  uint64_t StateHash() const;         // of positions and velocities
+  uint64_t StateHash() const;         // of positions and velocities, and of where the furniture stands
 
   void Save(Snapshot& s) const;
   std::shared_ptr<const mjModel_> model() const { return model_; }
-  const Task& task() const { return task_; }
+  const Task& task() const { return *task_; }
 
   static JointVector Home();  // tip at (.22, 0, .20), pointing down [rad]
 
  private:
   struct View;
-  const Task& task_;
+  void Place(const std::vector<Pose>& poses);
+  void FillVessel(int site);
+  void PhysicsStep();
+
+  const std::unique_ptr<Task> task_;
   std::shared_ptr<mjModel_> model_;
   std::unique_ptr<mjData_, void (*)(mjData_*)> data_;
   std::array<int, kNumJoints> joint_qpos_, joint_dof_, joint_actuator_;
+  std::array<double, kNumJoints> servo_damping_{};  // where MuJoCo's joints do it for the servos [Nm s]
   std::array<int, 2> finger_qpos_;
   std::vector<int> compensated_dofs_;
+  std::vector<int> beads_;  // bodies
   int gripper_actuator_ = 0;
   bool gripper_closed_ = false;
   int64_t ticks_ = 0;

@@ -30,12 +30,18 @@ void ArmSim::Status(ArmStatus& s) const {
   controller_.FillStatus(s);
 }
 
-void ArmSim::Truth(PlantTruth& t) const {
-  t.utime = world_.time_us();
-  t.objects = world_.Objects();
-  t.subgoals = world_.Subgoals();
-  t.success = world_.Success();
-  t.state_hash = world_.StateHash();
+void FillTruth(const World& world, PlantTruth& t) {
+  t.utime = world.time_us();
+  t.objects = world.Objects();
+  t.subgoals = world.Subgoals();
+  t.success = world.Success();
+  t.state_hash = world.StateHash();
+  const Contacts contacts = world.Touches();
+  t.touches = contacts.touches;
+  t.beads_in = contacts.beads_in;
+  t.beads = contacts.beads;
 }
+
+void ArmSim::Truth(PlantTruth& t) const { FillTruth(world_, t); }
 
 }  // namespace intabs

@@ -11,6 +11,9 @@
 
 namespace intabs {
 
+// What a world knows now. seq and frame_seq are the caller's.
+void FillTruth(const World& world, PlantTruth& truth);
+
 // Deterministic: a reset and the commands with the ticks they come at decide everything. One thread. Time is
 // simulation time from 0; where a wall clock rules, pass its time as `now_us` instead, always or never
 // between two resets.

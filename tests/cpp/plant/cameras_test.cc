@@ -13,6 +13,7 @@ extern "C" {
 #include <set>
 
 #include "intabs/plant/renderer.h"
+#include "intabs/plant/task.h"
 #include "intabs/plant/viewer.h"
 #include "plant/scripted_arm.h"
 
@@ -89,6 +90,29 @@ TEST_CASE("Left and right see the ground tag, and between them every object, whe
     CHECK(std::any_of(seen.begin(), seen.end(), [](int id) { return id >= 10 && id <= 13; }));
     CHECK(seen.count(20) == 1);
     for (const int id : seen) CHECK(std::set<int>{0, 10, 11, 12, 13, 20}.count(id) == 1);
+  }
+}
+
+TEST_CASE("In every task left and right see the ground tag, and between them every object at its start") {
+  for (const std::string& task : TaskNames()) {
+    World world(kModels, task);
+    Renderer renderer(world, kWidth, kHeight);
+    for (int seed = 0; seed < 3; ++seed) {
+      world.Reset(seed, 5);
+      CAPTURE(task, seed);
+      std::set<int> seen;  // objects: their tags are numbered 10 (id + 1) + n
+      for (const std::string camera : {"left", "right"}) {
+        const auto tags = Tags(Render(renderer, world, camera));
+        CHECK(tags.count(0) == 1);
+        for (const auto& [id, centre] : tags) seen.insert(id / 10 - 1);
+      }
+      seen.erase(-1);
+      std::set<int> there;
+      for (const TrackedObject& o : world.Objects()) {
+        if (o.id >= 0) there.insert(o.id);
+      }
+      CHECK(seen == there);
+    }
   }
 }
 

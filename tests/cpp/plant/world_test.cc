@@ -41,7 +41,7 @@ uint64_t Swing(World& world, int64_t seed, int ticks) {
 }
 
 // Geoms in contact in a state, by name.
-std::set<std::string> Contacts(const World& world) {
+std::set<std::string> PairsInContact(const World& world) {
   Snapshot s;
   world.Save(s);
   const mjModel* m = world.model().get();
@@ -114,14 +114,14 @@ TEST_CASE("At the start the arm rests at home, in touch with nothing, and stays 
     const Pose X_WG = ArmModel::Lite6().Tip(world.Arm().q);
     CHECK((X_WG.p - Eigen::Vector3d(0.22, 0, 0.20)).norm() < 1e-6);
     CHECK((X_WG.q * Eigen::Vector3d::UnitZ() + Eigen::Vector3d::UnitZ()).norm() < 1e-6);
-    CHECK(Contacts(world) == std::set<std::string>{"table - block_cube"});
+    CHECK(PairsInContact(world) == std::set<std::string>{"table - block_cube"});
     const Pose before = world.Objects()[0].X_WO;
     for (int i = 0; i < 250; ++i) world.Step({World::Home(), JointVector::Zero(), false});
     CHECK(world.time_us() == 1'000'000);
     CHECK((world.Arm().q - World::Home()).cwiseAbs().maxCoeff() < 1e-5);
     CHECK(world.Arm().dq.cwiseAbs().maxCoeff() < 1e-4);
     CHECK(world.Arm().gripper_opening == Approx(2 * 0.0089).margin(2e-4));
-    CHECK(Contacts(world) == std::set<std::string>{"table - block_cube"});
+    CHECK(PairsInContact(world) == std::set<std::string>{"table - block_cube"});
     const Eigen::Vector3d moved = world.Objects()[0].X_WO.p - before.p;
     CHECK(moved.head<2>().norm() < 1e-5);
     CHECK(std::abs(moved.z()) < 5e-4);  // contacts are springs
@@ -260,7 +260,10 @@ TEST_CASE("A block that hangs, falls or lies over the goal is no success") {
 
 TEST_CASE("An unknown task is refused in one line that lists those known") {
   const std::string error = ErrorOf([] { World world(kModels, "juggle"); });
-  CHECK(error == "unknown task \"juggle\"; known: pick_place");
+  CHECK(error ==
+        "unknown task \"juggle\"; known: pick_place, drawer_open, box_open, pour, stir, drawer_open+pick_place, "
+        "pour+stir, box_open+pour");
+  CHECK_THROWS_WITH(World(kModels, "stir+juggle"), Catch::Contains("unknown task \"stir+juggle\""));
 }
 
 TEST_CASE("A missing or broken scene is refused in one line that names the file") {

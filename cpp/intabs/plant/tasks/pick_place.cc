@@ -4,15 +4,14 @@
 namespace intabs {
 namespace {
 
-constexpr double kDegree = M_PI / 180;
 constexpr double kReach = 0.02;  // [m] from the goal
 constexpr double kHalf = 0.022;  // of the cube [m]
 
 class PickPlace final : public Task {
  public:
-  std::string name() const override { return "pick_place"; }
   std::vector<TaskObject> objects() const override {
-    return {{"block", 0, -15 * kDegree, 0.28, kHalf}, {"goal", 1, 15 * kDegree, 0.30, 0}};
+    return {{.body = "block", .slot = 0, .id = 0, .azimuth = -15 * kDegree, .radius = 0.28, .height = kHalf},
+            {.body = "goal", .slot = 1, .id = 1, .azimuth = 15 * kDegree, .radius = 0.30}};
   }
   std::vector<std::string> subgoals() const override { return {"grasped", "lifted", "placed"}; }
 
@@ -26,7 +25,7 @@ class PickPlace final : public Task {
     const Pose block = v.Body("block");
     const double distance = (block.p - v.Body("goal").p).head<2>().norm();
     if (v.gripper_closed || v.FingersTouch("block")) return "block not released";
-    if ((block.q * Eigen::Vector3d::UnitZ()).z() < 0.95) return "block fell over";
+    if (v.Upright("block") < kUpright) return "block fell over";
     if (std::abs(block.p.z() - kHalf) > 0.005) return "block does not stand on the table";
     if (v.LinearSpeed("block") > 0.01 || v.AngularSpeed("block") > 0.1) return "block not at rest";
     if (distance > kReach) return "block over 2 cm from the goal";
@@ -36,9 +35,6 @@ class PickPlace final : public Task {
 
 }  // namespace
 
-const Task& PickPlaceTask() {
-  static const PickPlace task;
-  return task;
-}
+std::unique_ptr<Task> MakePickPlace() { return std::make_unique<PickPlace>(); }
 
 }  // namespace intabs
