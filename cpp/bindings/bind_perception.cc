@@ -59,15 +59,7 @@ py::list Tags(const TagDetections& d) {
   return out;
 }
 
-py::dict Process(Pipeline& pipeline, const py::list& images, int64_t frame_seq, int64_t exposure_us) {
-  GrayImages gray;
-  for (const py::handle& h : images) gray.push_back(ToGray(h));
-  ObjectPoses poses;
-  CameraDetections detections;
-  {
-    py::gil_scoped_release release;
-    pipeline.Process(gray, frame_seq, exposure_us, poses, detections);
-  }
+py::dict Poses(const ObjectPoses& poses) {
   py::array_t<int32_t> id(kMaxObjects);
   py::array_t<double> pose({kMaxObjects, 7});
   py::array_t<float> covariance({kMaxObjects, 21});
@@ -83,9 +75,6 @@ py::dict Process(Pipeline& pipeline, const py::list& images, int64_t frame_seq, 
     *valid.mutable_data(i) = o.valid;
     *age.mutable_data(i) = o.age;
   }
-  py::dict tags;
-  for (size_t c = 0; c < gray.size(); ++c)
-    tags[py::str(pipeline.config().cameras[c].name)] = Tags(detections[c]);
   py::dict out;
   out["frame_seq"] = poses.frame_seq;
   out["exposure_us"] = poses.exposure_utime;
@@ -95,6 +84,22 @@ py::dict Process(Pipeline& pipeline, const py::list& images, int64_t frame_seq, 
   out["cameras"] = cameras;
   out["valid"] = valid;
   out["age"] = age;
+  return out;
+}
+
+py::dict Process(Pipeline& pipeline, const py::list& images, int64_t frame_seq, int64_t exposure_us) {
+  GrayImages gray;
+  for (const py::handle& h : images) gray.push_back(ToGray(h));
+  ObjectPoses poses;
+  CameraDetections detections;
+  {
+    py::gil_scoped_release release;
+    pipeline.Process(gray, frame_seq, exposure_us, poses, detections);
+  }
+  py::dict tags;
+  for (size_t c = 0; c < gray.size(); ++c)
+    tags[py::str(pipeline.config().cameras[c].name)] = Tags(detections[c]);
+  py::dict out = Poses(poses);
   out["tags"] = tags;
   return out;
 }
@@ -107,8 +112,10 @@ void Bind_perception(py::module_& m) {
       "Camera frames in, object poses in W out: the code of intabs_perception. Not for use by several "
       "threads at once.\n"
       "RuntimeError, one line, when the YAML file (models/config/perception.yaml) does not hold.")
-      .def(py::init([](const std::string& path) { return Pipeline(LoadPerceptionConfig(path)); }),
-           py::arg("config"))
+      .def(py::init([](const std::string& path, int threads, bool revisable) {
+             return Pipeline(LoadPerceptionConfig(path), {.threads = threads, .revisable = revisable});
+           }),
+           py::arg("config"), py::arg("threads") = 1, py::arg("revisable") = false)
       .def("process", &Process, py::arg("images"), py::arg("frame_seq"), py::arg("exposure_us"),
            "One frame of all cameras. images: one a camera, in the configuration's order, (H, W) grey or (H, "
            "W, 3) RGB\n"
@@ -120,6 +127,16 @@ void Bind_perception(py::module_& m) {
            "decision_margin}]}.\n"
            "A pose not seen is held, valid for 0.5 s. RuntimeError for images that do not fit the "
            "configuration.")
+      .def(
+          "revised",
+          [](const Pipeline& p) {
+            py::list out;
+            for (const ObjectPoses& poses : p.Revised()) out.append(Poses(poses));
+            return out;
+          },
+          "The poses of all frames since the last reset, decided anew with the frames after them in view: for "
+          "datasets. A list\n"
+          "of dicts as process() gives them, without tags; empty unless made with revisable=True.")
       .def("reset", &Pipeline::Reset, "As new.")
       .def("redo_extrinsics", &Pipeline::RedoExtrinsics,
            "Finds the places of the cameras anew; poses are kept.")

@@ -1,6 +1,8 @@
 """The Pipeline of the C++ side, called from Python."""
 
+import json
 import math
+import subprocess
 
 import numpy as np
 import pytest
@@ -32,6 +34,18 @@ def test_frames_without_tags_give_unused_slots(pipeline):
         assert not out["valid"].any()
         assert out["tags"] == {"left": [], "right": []}
     assert pipeline.camera_pose(0) is None
+
+
+def test_revised_poses_are_of_the_same_frames():
+    pipeline = _core.Pipeline(str(CONFIG), revisable=True)
+    for i in range(3):
+        pipeline.process([black(480, 640), None], i + 1, 40_000 * i)
+    revised = pipeline.revised()
+    assert [r["frame_seq"] for r in revised] == [1, 2, 3]
+    assert [r["exposure_us"] for r in revised] == [0, 40_000, 80_000]
+    assert all((r["id"] == -1).all() for r in revised)
+    pipeline.reset()
+    assert pipeline.revised() == []
 
 
 def test_what_does_not_fit_is_refused_in_one_line(pipeline):
@@ -67,6 +81,77 @@ def picture_of_ground_tag(R_CW, p_WC):
         (640, 480), image.Transform.PERSPECTIVE, np.linalg.solve(rows, rhs), image.Resampling.BICUBIC, fillcolor=120
     )
     return np.array(view, np.uint8)
+
+
+def look_at_ground_tag(p_WC):
+    """R_CW of a camera at p_WC that looks at the ground tag: z ahead, y down."""
+    z = (np.array([0.52, 0, 0]) - p_WC) / np.linalg.norm(np.array([0.52, 0, 0]) - p_WC)
+    x = np.cross(z, [0, 0, 1.0])
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def folder_of_frames(folder, n=4):
+    image = pytest.importorskip("PIL.Image")
+    cameras, pictures = {}, {}
+    for name, y in (("left", 0.3), ("right", -0.3)):
+        p_WC = np.array([1.1, y, 0.5])
+        R_CW = look_at_ground_tag(p_WC)
+        X_WC = np.eye(4)
+        X_WC[:3, :3], X_WC[:3, 3] = R_CW.T, p_WC
+        cameras[name] = {
+            "K": [[610, 0, 319.5], [0, 610, 239.5], [0, 0, 1]],
+            "width": 640,
+            "height": 480,
+            "X_WC": X_WC.tolist(),
+        }
+        pictures[name] = f"{name}.png"
+        image.fromarray(picture_of_ground_tag(R_CW, p_WC)).save(folder / pictures[name])
+    frames = [{"time_s": i / 30, "images": pictures} for i in range(n)]
+    head = {"tag_size_m": 0.12, "family": "tag36h11", "cameras": cameras, "frames": frames}
+    (folder / "frames.json").write_text(json.dumps(head))
+
+
+def solve_folder(folder, *options):
+    program = paths.program("intabs_perception")
+    result = folder / "result.json"
+    command = [str(program), "--frames", str(folder), "--result", str(result), *options]
+    out = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    return out, json.loads(result.read_text()) if out.returncode == 0 else None
+
+
+def test_a_folder_is_solved_with_what_is_known_of_the_cameras(tmp_path):
+    folder_of_frames(tmp_path)
+    sizes = {}
+    for options in ((), ("--offline",), ("--single",), ("--extrinsic-sigma", "2,0.3")):
+        out, result = solve_folder(tmp_path, *options, "--json", str(tmp_path / "figures.json"))
+        assert out.returncode == 0, out.stderr
+        assert [r["frame"] for r in result] == [0, 1, 2, 3]
+        for r in result:
+            X = np.array(r["tags"]["0"])
+            assert X[:3, 3] == pytest.approx([0.52, 0, 0.001], abs=0.002)
+            assert X[:3, :3] == pytest.approx(np.diag([1, -1, -1]), abs=0.02)
+            sizes[options] = np.sqrt(np.diag(np.array(r["covariance"]["0"])))
+        figures = json.loads((tmp_path / "figures.json").read_text())
+        assert figures["frames"] == 4
+        assert figures["ratio"] == pytest.approx(figures["detect_ms"]["p50"] / figures["full_frame_ms"]["p50"])
+    assert (sizes["--extrinsic-sigma", "2,0.3"] > sizes[()]).all()  # who knows less says so
+
+
+def test_a_folder_that_does_not_hold_ends_in_one_line(tmp_path):
+    folder_of_frames(tmp_path)
+    for options, words in (
+        (("--extrinsic-sigma", "2"), "extrinsic-sigma"),
+        (("--extrinsic-sigma", "2,-1"), "extrinsic-sigma"),
+    ):
+        out, _ = solve_folder(tmp_path, *options)
+        assert out.returncode != 0
+        assert words in out.stderr
+        assert len(out.stderr.strip().splitlines()) == 1
+    (tmp_path / "left.png").write_text("no picture")
+    out, _ = solve_folder(tmp_path)
+    assert out.returncode != 0
+    assert "left.png" in out.stderr.strip().splitlines()[-1]
 
 
 def test_the_ground_tag_tells_where_a_camera_stands(pipeline):

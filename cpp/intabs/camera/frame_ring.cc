@@ -185,7 +185,10 @@ void FrameRingWriter::Write(int camera, int64_t frame_seq, int64_t exposure_us, 
 }
 
 struct FrameRingReader::Map : Mapping {
-  using Mapping::Mapping;
+  Map(const std::string& n, ino_t i, void* base, const Layout& layout)
+      : Mapping(base, layout), name(n), inode(i) {}
+  const std::string name;
+  const ino_t inode;
 };
 
 FrameRingReader::FrameRingReader(const std::string& name) {
@@ -214,7 +217,7 @@ FrameRingReader::FrameRingReader(const std::string& name) {
     munmap(base, size);
     throw Error(name, unreadable);
   }
-  map_ = std::make_unique<Map>(base, layout);
+  map_ = std::make_unique<Map>(name, file.st_ino, base, layout);
   for (int i = 0; i < layout.num_cameras; ++i)
     cameras_.emplace_back(h.names[i], strnlen(h.names[i], kNameSize));
 }
@@ -241,19 +244,25 @@ int64_t FrameRingReader::newest_seq() const noexcept {
   return newest;
 }
 
-bool FrameRingReader::Read(int64_t frame_seq, int camera, Frame& out) const {
-  if (camera < 0 || camera >= map_->layout.num_cameras || frame_seq < 1) return false;
+bool FrameRingReader::current() const noexcept {
+  const Descriptor fd(shm_open(map_->name.c_str(), O_RDONLY, 0));
+  struct stat file;
+  return fd.fd >= 0 && fstat(fd.fd, &file) == 0 && file.st_ino == map_->inode;
+}
+
+FrameRead FrameRingReader::Read(int64_t frame_seq, int camera, Frame& out) const {
+  if (camera < 0 || camera >= map_->layout.num_cameras || frame_seq < 1) return FrameRead::kAbsent;
   const size_t i = map_->Index(camera, frame_seq);
   const Slot& slot = map_->slot(i);
   const int64_t version = slot.version.load(std::memory_order_acquire);
-  if (version == 0 || version % 2 != 0) return false;
-  if (slot.frame_seq.load(std::memory_order_acquire) != frame_seq) return false;
+  if (slot.frame_seq.load(std::memory_order_acquire) != frame_seq) return FrameRead::kAbsent;
+  if (version % 2 != 0) return FrameRead::kTorn;
   out.frame_seq = frame_seq;
   out.exposure_us = slot.exposure_us.load(std::memory_order_acquire);
   if (!out.rgb.isContinuous()) out.rgb.release();
   out.rgb.create(map_->layout.height, map_->layout.width, CV_8UC3);
   LoadWords(map_->pixels(i), out.rgb.data, map_->layout.bytes());
-  return slot.version.load(std::memory_order_relaxed) == version;
+  return slot.version.load(std::memory_order_relaxed) == version ? FrameRead::kWhole : FrameRead::kTorn;
 }
 
 }  // namespace intabs

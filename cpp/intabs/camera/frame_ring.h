@@ -4,18 +4,18 @@
 
 #include <cstdint>
 #include <memory>
-#include <opencv2/core/mat.hpp>
 #include <string>
 #include <vector>
 
+#include "intabs/camera/frame.h"
 #include "intabs/core/types.h"
 
 namespace intabs {
 
-struct Frame {
-  int64_t frame_seq = 0;
-  int64_t exposure_us = 0;
-  cv::Mat rgb;  // (H, W) CV_8UC3, row 0 on top
+enum class FrameRead {
+  kWhole,
+  kAbsent,  // not written yet, or overwritten already
+  kTorn,    // is being written, or was overwritten during the copy
 };
 
 // One thread. Set-up throws std::runtime_error in one line.
@@ -59,9 +59,11 @@ class FrameRingReader {
   // The newest frame that all cameras have; 0: none yet.
   int64_t newest_seq() const noexcept;
 
-  // Copies that frame out; reuses out.rgb's memory. False when it is not written yet, overwritten already, or
-  // was overwritten during the copy: `out` then holds nothing of use.
-  bool Read(int64_t frame_seq, int camera, Frame& out) const;
+  // Copies that frame out; reuses out.rgb's memory. `out` holds nothing of use unless it is whole.
+  FrameRead Read(int64_t frame_seq, int camera, Frame& out) const;
+
+  // Whether the name still leads to this ring: false when its writer took it away, or another one came.
+  bool current() const noexcept;
 
  private:
   struct Map;

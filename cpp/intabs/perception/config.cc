@@ -2,13 +2,19 @@
 
 #include <algorithm>
 #include <array>
+#include <cerrno>
+#include <charconv>
 #include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
 #include <fstream>
-#include <initializer_list>
 #include <opencv2/core.hpp>
 #include <set>
+#include <span>
 #include <sstream>
 #include <stdexcept>
+#include <vector>
 
 #include "intabs/core/types.h"
 
@@ -18,7 +24,7 @@ namespace {
 [[noreturn]] void Fail(const std::string& what) { throw std::runtime_error(what); }
 
 // Every map says which keys it has: a misspelt key is an error, not a silent default.
-void AllowOnly(const cv::FileNode& map, const std::string& where, std::initializer_list<const char*> keys) {
+void AllowOnly(const cv::FileNode& map, const std::string& where, const std::vector<const char*>& keys) {
   if (!map.isMap()) Fail(where + ": expected a map of values");
   for (const std::string& key : map.keys()) {
     if (std::none_of(keys.begin(), keys.end(), [&](const char* k) { return key == k; })) {
@@ -67,26 +73,87 @@ Pose ReadPose(const cv::FileNode& node, const std::string& where) {
   return {{p[0], p[1], p[2]}, rotation.normalized()};
 }
 
-PerceptionConfig Read(const cv::FileNode& root) {
+// A number in the fewest digits that give the same one again.
+std::string Shortest(double v) {
+  char text[32];
+  return {text, std::to_chars(text, text + sizeof(text), v).ptr};
+}
+
+// Lists of what a sequence holds; a lone value is no list.
+cv::FileNode Sequence(const cv::FileNode& node, const std::string& where) {
+  if (!node.isSeq()) Fail(where + ": expected a list");
+  return node;
+}
+
+Notes ReadNotes(const cv::FileNode& node, const std::string& where) {
+  Notes notes;
+  if (node.empty()) return notes;
+  if (!node.isMap()) Fail(where + ": expected a map of values");
+  for (const std::string& key : node.keys()) {
+    const cv::FileNode value = node[key];
+    const std::string at = where + "." + key;
+    if (value.isInt()) {
+      notes.emplace_back(key, std::to_string(Integer(value, at)));
+    } else {
+      notes.emplace_back(key, value.isReal() ? Shortest(Number(value, at)) : Text(value, at));
+    }
+  }
+  return notes;
+}
+
+std::vector<Calibration::Camera> ReadCameras(const cv::FileNode& list) {
+  std::vector<Calibration::Camera> cameras;
+  for (const cv::FileNode& node : Sequence(list, "cameras")) {
+    const std::string at = "cameras[" + std::to_string(cameras.size()) + "]";
+    AllowOnly(node, at,
+              {"name", "width", "height", "fx", "fy", "cx", "cy", "distortion", "X_WC", "source",
+               "intrinsics", "extrinsics"});
+    Calibration::Camera& camera = cameras.emplace_back();
+    CameraModel& m = camera.model;
+    m.name = Text(Get(node, at, "name"), at + ".name");
+    m.width = Integer(Get(node, at, "width"), at + ".width");
+    m.height = Integer(Get(node, at, "height"), at + ".height");
+    m.fx = Number(Get(node, at, "fx"), at + ".fx");
+    m.fy = Number(Get(node, at, "fy"), at + ".fy");
+    m.cx = Number(Get(node, at, "cx"), at + ".cx");
+    m.cy = Number(Get(node, at, "cy"), at + ".cy");
+    if (!node["distortion"].empty()) m.distortion = Numbers<5>(node["distortion"], at + ".distortion");
+    if (!node["X_WC"].empty()) m.X_WC = ReadPose(node["X_WC"], at + ".X_WC");
+    if (!node["source"].empty()) m.source = Text(node["source"], at + ".source");
+    camera.intrinsics = ReadNotes(node["intrinsics"], at + ".intrinsics");
+    camera.extrinsics = ReadNotes(node["extrinsics"], at + ".extrinsics");
+  }
+  return cameras;
+}
+
+Calibration ReadCalibration(const cv::FileNode& root) {
+  AllowOnly(root, "top level", {"cameras", "X_WB", "hand_eye"});
+  Calibration calibration;
+  if (!root["cameras"].empty()) calibration.cameras = ReadCameras(root["cameras"]);
+  if (!root["X_WB"].empty()) calibration.X_WB = ReadPose(root["X_WB"], "X_WB");
+  calibration.hand_eye = ReadNotes(root["hand_eye"], "hand_eye");
+  return calibration;
+}
+
+// `folder`: of the file, with a slash at its end.
+PerceptionConfig Read(const cv::FileNode& root, const std::string& folder) {
   PerceptionConfig config;
-  AllowOnly(root, "top level", {"cameras", "ground", "objects", "corner_sigma_px"});
+  AllowOnly(root, "top level", {kConfigKeys.begin(), kConfigKeys.end()});
   if (!root["corner_sigma_px"].empty())
     config.corner_sigma_px = Number(root["corner_sigma_px"], "corner_sigma_px");
 
-  for (const cv::FileNode& node : Get(root, "top level", "cameras")) {
-    const std::string at = "cameras[" + std::to_string(config.cameras.size()) + "]";
-    AllowOnly(node, at, {"name", "width", "height", "fx", "fy", "cx", "cy", "X_WC"});
-    CameraModel camera;
-    camera.name = Text(Get(node, at, "name"), at + ".name");
-    camera.width = Integer(Get(node, at, "width"), at + ".width");
-    camera.height = Integer(Get(node, at, "height"), at + ".height");
-    camera.fx = Number(Get(node, at, "fx"), at + ".fx");
-    camera.fy = Number(Get(node, at, "fy"), at + ".fy");
-    camera.cx = Number(Get(node, at, "cx"), at + ".cx");
-    camera.cy = Number(Get(node, at, "cy"), at + ".cy");
-    if (!node["X_WC"].empty()) camera.X_WC = ReadPose(node["X_WC"], at + ".X_WC");
-    config.cameras.push_back(camera);
+  Calibration calibration;
+  if (const cv::FileNode file = root["calibration"]; !file.empty()) {
+    if (!root["cameras"].empty() || !root["X_WB"].empty())
+      Fail("calibration: its file gives cameras and X_WB; take them out here");
+    const std::string name = Text(file, "calibration");
+    calibration = LoadCalibration(name.starts_with('/') ? name : folder + name);
+  } else {
+    calibration.cameras = ReadCameras(Get(root, "top level", "cameras"));
+    if (!root["X_WB"].empty()) calibration.X_WB = ReadPose(root["X_WB"], "X_WB");
   }
+  for (const Calibration::Camera& c : calibration.cameras) config.cameras.push_back(c.model);
+  config.X_WB = calibration.X_WB.value_or(Pose{});
 
   if (const cv::FileNode node = root["ground"]; !node.empty()) {
     AllowOnly(node, "ground", {"id", "size", "X_WT"});
@@ -95,14 +162,14 @@ PerceptionConfig Read(const cv::FileNode& root) {
                               ReadPose(Get(node, "ground", "X_WT"), "ground.X_WT")};
   }
 
-  for (const cv::FileNode& node : Get(root, "top level", "objects")) {
+  for (const cv::FileNode& node : Sequence(Get(root, "top level", "objects"), "objects")) {
     const std::string at = "objects[" + std::to_string(config.objects.size()) + "]";
     AllowOnly(node, at, {"slot", "id", "name", "tags"});
     ObjectModel object;
     object.slot = Integer(Get(node, at, "slot"), at + ".slot");
     object.id = Integer(Get(node, at, "id"), at + ".id");
     object.name = Text(Get(node, at, "name"), at + ".name");
-    for (const cv::FileNode& tag : Get(node, at, "tags")) {
+    for (const cv::FileNode& tag : Sequence(Get(node, at, "tags"), at + ".tags")) {
       const std::string tag_at = at + ".tags[" + std::to_string(object.tags.size()) + "]";
       AllowOnly(tag, tag_at, {"id", "size", "X_OT"});
       object.tags.push_back({Integer(Get(tag, tag_at, "id"), tag_at + ".id"),
@@ -112,6 +179,17 @@ PerceptionConfig Read(const cv::FileNode& root) {
     config.objects.push_back(object);
   }
   return config;
+}
+
+// Whether pixels of the picture can be traced back through the distortion.
+bool Unfolds(const CameraModel& camera) {
+  for (const double x : {0.0, 0.5, 1.0}) {
+    for (const double y : {0.0, 0.5, 1.0}) {
+      const Eigen::Vector2d uv(x * camera.width, y * camera.height);
+      if (!((camera.Distort(camera.Undistort(uv)) - uv).norm() < 0.01)) return false;
+    }
+  }
+  return true;
 }
 
 }  // namespace
@@ -129,11 +207,15 @@ void Check(const PerceptionConfig& config) {
     if (!(c.fx > 0 && c.fy > 0 && std::isfinite(c.cx) && std::isfinite(c.cy))) {
       Fail("camera " + c.name + ": fx, fy must be > 0 and cx, cy finite");
     }
+    if (!Unfolds(c)) {
+      Fail("camera " + c.name +
+           ": the distortion cannot be undone at the edges of its picture: calibrate anew");
+    }
     if (!c.X_WC && !config.ground) {
       Fail("camera " + c.name + ": neither X_WC nor a ground tag says where it stands; give one");
     }
   }
-  std::set<int> tags, slots;
+  std::set<int> tags, ids;
   const auto check_tag = [&](int id, double size) {
     if (id < 0 || id > 586) Fail("tag " + std::to_string(id) + ": tag36h11 has ids 0 to 586");
     if (!(size > 0)) Fail("tag " + std::to_string(id) + ": size " + std::to_string(size) + " m, must be > 0");
@@ -141,11 +223,13 @@ void Check(const PerceptionConfig& config) {
   };
   if (config.ground) check_tag(config.ground->id, config.ground->size);
   for (const ObjectModel& o : config.objects) {
-    if (o.slot < 0 || o.slot >= kMaxObjects || !slots.insert(o.slot).second) {
-      Fail("object " + o.name + ": slot " + std::to_string(o.slot) + " is taken or not in 0 .. " +
+    if (o.slot < 0 || o.slot >= kMaxObjects) {
+      Fail("object " + o.name + ": slot " + std::to_string(o.slot) + ", must be 0 to " +
            std::to_string(kMaxObjects - 1));
     }
-    if (o.id < 0) Fail("object " + o.name + ": id " + std::to_string(o.id) + ", must be >= 0");
+    if (o.id < 0 || !ids.insert(o.id).second) {
+      Fail("object " + o.name + ": id " + std::to_string(o.id) + " is taken or below 0");
+    }
     if (o.tags.empty()) Fail("object " + o.name + " has no tags");
     for (const ObjectTag& t : o.tags) check_tag(t.id, t.size);
   }
@@ -154,22 +238,95 @@ void Check(const PerceptionConfig& config) {
   }
 }
 
-PerceptionConfig LoadPerceptionConfig(const std::string& path) {
+namespace {
+
+// read(root, folder of the file).
+template <class F>
+auto Load(const std::string& path, const F& read) {
   std::ifstream file(path);
   if (!file) Fail(path + ": cannot be read");
   std::stringstream text;
-  text << "%YAML:1.0\n---\n" << file.rdbuf();  // the heading that OpenCV insists on
+  text << "%YAML:1.0\n---\n";  // the heading that OpenCV insists on
+  for (std::string line; std::getline(file, line);) {
+    const std::string key = line.substr(0, line.find(':'));
+    const bool option = std::find(kProgramKeys.begin(), kProgramKeys.end(), key) != kProgramKeys.end();
+    text << (option ? "" : line) << "\n";
+  }
   try {
     const cv::FileStorage storage(
         text.str(), cv::FileStorage::READ | cv::FileStorage::MEMORY | cv::FileStorage::FORMAT_YAML);
-    PerceptionConfig config = Read(storage.root());
-    Check(config);
-    return config;
+    return read(storage.root(), path.substr(0, path.rfind('/') + 1));
   } catch (const cv::Exception& e) {
-    Fail(path + ": not readable as YAML: " + e.err);
+    // OpenCV has "(LINE): what" in the place of the function's name; the line counts our heading.
+    const size_t at = e.func.find("): ");
+    const bool placed = e.func.starts_with('(') && at != std::string::npos;
+    Fail(path + ": not readable as YAML: " +
+         (placed ? "line " + std::to_string(std::atoi(e.func.c_str() + 1) - 2) + e.func.substr(at + 1)
+                 : e.err));
   } catch (const std::runtime_error& e) {
     Fail(path + ": " + e.what());
   }
+}
+
+std::string Flow(const Notes& notes) {
+  std::string out;
+  for (const auto& [key, value] : notes) {
+    const bool number = !value.empty() && value.find_first_not_of("0123456789.-+e") == std::string::npos &&
+                        value.find('-', 1) == std::string::npos;
+    out += (out.empty() ? "" : ", ") + key + ": " + (number ? value : '"' + value + '"');
+  }
+  return "{" + out + "}";
+}
+
+std::string Flow(std::span<const double> values) {
+  std::string out;
+  for (const double v : values) out += (out.empty() ? "" : ", ") + Shortest(v);
+  return "[" + out + "]";
+}
+
+std::string Flow(const Pose& X) {
+  const std::array<double, 4> q{X.q.w(), X.q.x(), X.q.y(), X.q.z()};
+  return "{p: " + Flow(std::span(X.p.data(), 3)) + ", q: " + Flow(q) + "}";
+}
+
+}  // namespace
+
+PerceptionConfig LoadPerceptionConfig(const std::string& path) {
+  return Load(path, [](const cv::FileNode& root, const std::string& folder) {
+    PerceptionConfig config = Read(root, folder);
+    Check(config);
+    return config;
+  });
+}
+
+Calibration LoadCalibration(const std::string& path) {
+  return Load(path, [](const cv::FileNode& root, const std::string&) { return ReadCalibration(root); });
+}
+
+void SaveCalibration(const std::string& path, const Calibration& calibration) {
+  std::ostringstream out;
+  out << "# Written by tools/calibrate. `calibration: FILE` in a configuration of intabs_perception takes "
+         "it.\n"
+         "# Lengths in m, quaternions (w, x, y, z), distortion k1 k2 p1 p2 k3.\n";
+  if (!calibration.cameras.empty()) out << "cameras:\n";
+  for (const auto& [m, intrinsics, extrinsics] : calibration.cameras) {
+    out << "  - name: " << m.name << "\n    width: " << m.width << "\n    height: " << m.height
+        << "\n    fx: " << Shortest(m.fx) << "\n    fy: " << Shortest(m.fy) << "\n    cx: " << Shortest(m.cx)
+        << "\n    cy: " << Shortest(m.cy) << "\n";
+    if (m.distorted()) out << "    distortion: " << Flow(m.distortion) << "\n";
+    if (m.X_WC) out << "    X_WC: " << Flow(*m.X_WC) << "\n";
+    if (!m.source.empty()) out << "    source: \"" << m.source << "\"\n";
+    if (!intrinsics.empty()) out << "    intrinsics: " << Flow(intrinsics) << "\n";
+    if (!extrinsics.empty()) out << "    extrinsics: " << Flow(extrinsics) << "\n";
+  }
+  if (calibration.X_WB) out << "X_WB: " << Flow(*calibration.X_WB) << "\n";
+  if (!calibration.hand_eye.empty()) out << "hand_eye: " << Flow(calibration.hand_eye) << "\n";
+  const std::string part = path + ".partial";
+  std::ofstream file(part);
+  file << out.str();
+  file.close();
+  if (!file || std::rename(part.c_str(), path.c_str()) != 0)
+    Fail(path + ": cannot be written: " + std::strerror(errno));
 }
 
 }  // namespace intabs

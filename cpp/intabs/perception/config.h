@@ -1,8 +1,11 @@
-// What perception knows beforehand: cameras, the ground tag, and which tags sit where on which object.
+// What perception knows beforehand: cameras, the ground tag, and which tags sit where on which object. Read
+// from one YAML file; what calibration finds (tools/calibrate) may stand in a file of its own.
 #pragma once
 
+#include <array>
 #include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "intabs/perception/camera_model.h"
@@ -22,8 +25,8 @@ struct ObjectTag {
 };
 
 struct ObjectModel {
-  int slot = 0;  // of ObjectPoses
-  int id = 0;
+  int slot = 0;  // of ObjectPoses; several objects may name one, of which a scene holds one at most
+  int id = 0;    // unique
   std::string name;
   std::vector<ObjectTag> tags;
 };
@@ -32,16 +35,42 @@ struct PerceptionConfig {
   std::vector<CameraModel> cameras;  // at most kMaxCameras
   std::optional<GroundTag> ground;   // needed unless every camera has its X_WC
   std::vector<ObjectModel> objects;
+  Pose X_WB;                      // arm base in W (hand-eye); identity: W is the base, as in the plant
   double corner_sigma_px = 0.05;  // standard deviation of a tag corner's coordinate
 };
 
-// Throws std::runtime_error that names the field and its value: no camera, a tag or slot used twice, sizes <=
+// The keys of the file. Options of intabs_perception may stand in it too, each on a line; they are not looked
+// at here.
+inline constexpr std::array kConfigKeys = {"cameras", "ground",   "objects",    "corner_sigma_px",
+                                           "X_WB",    "hand_eye", "calibration"};
+inline constexpr std::array kProgramKeys = {"lcm", "prefix", "ring", "json"};
+
+// Throws std::runtime_error that names the field and its value: no camera, a tag or id used twice, sizes <=
 // 0, ...
 void Check(const PerceptionConfig& config);
 
 // Reads and checks a file like models/config/perception.yaml. Throws std::runtime_error "FILE: what is
 // wrong". Read by OpenCV's own YAML reader, so that processes, bindings and tests share one loader without
-// another library.
+// another library. `calibration: FILE` (seen from that file) takes cameras and X_WB from there.
 PerceptionConfig LoadPerceptionConfig(const std::string& path);
+
+// How something was found, for people: key and value (a number, or a text that needs no quotes).
+using Notes = std::vector<std::pair<std::string, std::string>>;
+
+// What tools/calibrate finds: the keys `cameras`, `X_WB` and `hand_eye` of the same format, with notes beside
+// them that LoadPerceptionConfig passes over.
+struct Calibration {
+  struct Camera {
+    CameraModel model;
+    Notes intrinsics, extrinsics;
+  };
+  std::vector<Camera> cameras;
+  std::optional<Pose> X_WB;
+  Notes hand_eye;
+};
+
+// Throw std::runtime_error "FILE: what is wrong".
+Calibration LoadCalibration(const std::string& path);
+void SaveCalibration(const std::string& path, const Calibration& calibration);  // replaces the file at once
 
 }  // namespace intabs

@@ -3,6 +3,7 @@
 #include <Eigen/LU>
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 
 namespace intabs {
 namespace {
@@ -10,25 +11,36 @@ namespace {
 constexpr double kOtherMinimum = 10 * M_PI / 180;  // two poses turned by more are two hypotheses
 constexpr size_t kRefined = 4;                     // starts that are refined, best first
 
+// Chi-square of a single tag says little about its corners' noise; that of many tags says a lot. So it is
+// weighed against so many degrees of freedom of what the corners' own covariances say.
+constexpr double kPriorFreedom = 8;
+
 struct Candidate {
   Pose X_WO;
   double rms_px;
 };
 
-std::vector<PointView> PointsOf(std::span<const TagView> views) {
+struct Corners {
   std::vector<PointView> points;
-  points.reserve(4 * views.size());
+  std::vector<Matrix8d> weights;  // one a view
+};
+
+Corners CornersOf(std::span<const TagView> views, double sigma_px) {
+  Corners out;
+  out.points.reserve(4 * views.size());
+  out.weights.reserve(views.size());
   for (const TagView& view : views) {
     const auto points_T = TagPoints(view.size);
-    for (int k = 0; k < 4; ++k) points.push_back({view.X_OT * points_T[k], view.corners[k], view.camera});
+    for (int k = 0; k < 4; ++k) out.points.push_back({view.X_OT * points_T[k], view.corners[k], view.camera});
+    out.weights.push_back(Whitening(view.covariance + sigma_px * sigma_px * Matrix8d::Identity()));
   }
-  return points;
+  return out;
 }
 
 ObjectFit SolveOnce(std::span<const PlacedCamera> cameras, std::span<const TagView> views,
                     const ObjectSolverLimits& limits) {
   ObjectFit out;
-  const std::vector<PointView> points = PointsOf(views);
+  const auto [points, weights] = CornersOf(views, limits.corner_sigma_px);
   std::vector<Candidate> starts;
   for (const TagView& view : views) {
     if (!view.hypotheses.ok) continue;
@@ -41,32 +53,33 @@ ObjectFit SolveOnce(std::span<const PlacedCamera> cameras, std::span<const TagVi
                    [](const Candidate& a, const Candidate& b) { return a.rms_px < b.rms_px; });
   std::vector<PoseFit> minima;
   for (size_t i = 0; i < starts.size() && i < kRefined; ++i) {
-    PoseFit fit = FitPose(cameras, points, starts[i].X_WO);
+    PoseFit fit = FitPose(cameras, points, starts[i].X_WO, weights);
     if (fit.ok) minima.push_back(fit);
   }
   if (minima.empty()) return out;
   std::stable_sort(minima.begin(), minima.end(),
-                   [](const PoseFit& a, const PoseFit& b) { return a.rms_px < b.rms_px; });
+                   [](const PoseFit& a, const PoseFit& b) { return a.cost < b.cost; });
   const PoseFit& best = minima.front();
-  out.ok = true;
-  out.X_WO = best.X_WO;
+  // Residuals larger than the corners' noise tell of something that the noise does not know.
+  const double freedom = std::max(0.0, 2.0 * static_cast<double>(points.size()) - 6.0);
+  const double variance = std::max(1.0, (best.cost + kPriorFreedom) / (freedom + kPriorFreedom));
+  uint8_t used = 0;
+  for (const TagView& view : views) used |= static_cast<uint8_t>(1u << view.camera);
+  const auto add = [&](const PoseFit& fit) {
+    out.minima.push_back({fit.X_WO, variance * fit.information.inverse(), fit.cost / (2 * variance), used});
+  };
+  add(best);
+  out.ok = out.minima[0].covariance.allFinite();
   out.rms_px = best.rms_px;
   for (const PoseFit& other : minima) {
-    if (AngleBetween(best.X_WO.q, other.X_WO.q) > kOtherMinimum) {
-      out.ambiguity = other.rms_px > 0 ? best.rms_px / other.rms_px : 1.0;
-      break;
-    }
+    if (AngleBetween(best.X_WO.q, other.X_WO.q) <= kOtherMinimum) continue;
+    add(other);
+    out.ambiguity = other.rms_px > 0 ? best.rms_px / other.rms_px : 1.0;
+    out.p_wrong = Probability(out.minima[1].cost, out.minima[0].cost);
+    break;
   }
-  // Residuals larger than the corners' usual noise tell of something that the noise does not know.
-  const double freedom = std::max(1.0, 2.0 * points.size() - 6.0);
-  const double chi2 = best.rms_px * best.rms_px * points.size() / freedom;
-  const double variance = std::max(chi2, limits.corner_sigma_px * limits.corner_sigma_px);
-  out.covariance = variance * best.information.inverse();
   out.tags = static_cast<int>(views.size());
-  for (const TagView& view : views) out.cameras |= static_cast<uint8_t>(1u << view.camera);
-  const bool alone = views.size() == 1;
-  out.valid = out.rms_px <= limits.max_rms_px && !(alone && out.ambiguity > limits.max_ambiguity) &&
-              out.covariance.allFinite();
+  out.valid = out.ok && out.rms_px <= limits.max_rms_px && out.p_wrong <= limits.max_wrong;
   return out;
 }
 
@@ -77,7 +90,7 @@ int WorstView(std::span<const PlacedCamera> cameras, std::span<const TagView> vi
   for (size_t i = 0; i < views.size(); ++i) {
     const auto same_camera = [&](const TagView& v) { return v.camera == views[i].camera; };
     if (std::count_if(views.begin(), views.end(), same_camera) < 2) continue;
-    const double rms = ReprojectionRms(cameras, PointsOf(views.subspan(i, 1)), X_WO);
+    const double rms = ReprojectionRms(cameras, CornersOf(views.subspan(i, 1), 0).points, X_WO);
     if (rms > worst_rms) {
       worst = static_cast<int>(i);
       worst_rms = rms;
@@ -92,12 +105,33 @@ ObjectFit SolveObject(std::span<const PlacedCamera> cameras, std::vector<TagView
                       const ObjectSolverLimits& limits) {
   ObjectFit fit = SolveOnce(cameras, views, limits);
   while (fit.ok && fit.rms_px > limits.max_rms_px) {
-    const int worst = WorstView(cameras, views, fit.X_WO);
+    const int worst = WorstView(cameras, views, fit.minima[0].X_WO);
     if (worst < 0) break;
     views.erase(views.begin() + worst);
     fit = SolveOnce(cameras, views, limits);
   }
+  if (!fit.ok || fit.rms_px <= limits.max_rms_px) return fit;
+  fit.minima.clear();
+  for (size_t c = 0; c < cameras.size(); ++c) {
+    std::vector<TagView> own;
+    std::copy_if(views.begin(), views.end(), std::back_inserter(own),
+                 [&](const TagView& v) { return v.camera == static_cast<int>(c); });
+    if (own.empty()) continue;
+    const ObjectFit alone = SolveOnce(cameras, own, limits);
+    if (!alone.ok || alone.rms_px > limits.max_rms_px) continue;
+    for (ObjectPose minimum : alone.minima) {
+      minimum.cost -= alone.minima[0].cost;  // those of different pictures cannot be compared
+      fit.minima.push_back(minimum);
+    }
+  }
+  fit.ok = !fit.minima.empty();
   return fit;
+}
+
+Matrix6d CovarianceOfChoice(const ObjectPose& chosen, const ObjectPose& other, double p_other) {
+  Vector6d d;
+  d << LogSO3(other.X_WO.q * chosen.X_WO.q.conjugate()), other.X_WO.p - chosen.X_WO.p;
+  return (1 - p_other) * chosen.covariance + p_other * (other.covariance + d * d.transpose());
 }
 
 std::array<float, 21> PackCovariance(const Matrix6d& covariance) {

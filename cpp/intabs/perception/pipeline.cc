@@ -1,7 +1,9 @@
 #include "intabs/perception/pipeline.h"
 
+#include <algorithm>
 #include <chrono>
 #include <cmath>
+#include <limits>
 #include <opencv2/imgproc.hpp>
 #include <stdexcept>
 #include <string>
@@ -11,11 +13,14 @@ namespace {
 
 constexpr double kMovedPx = 3;  // the ground tag's RMS distance from its place that tells of a moved camera
 constexpr double kSameGroundPx = 1;  // while averaging: a larger step starts the mean again
+constexpr double kMaxWrong = 0.01;   // a pose is believed up to this probability of being another one
 constexpr double kGroundAmbiguity = 0.6;
 constexpr double kGroundSame =
     5 * M_PI / 180;                     // seen face on, the two hypotheses grow together: either will do
 constexpr double kFacing = 0.1;         // cosine; tags seen more obliquely are not looked for
-constexpr double kObjectMarginPx = 24;  // 0.5 m/s at 0.6 m is 20 px a frame at 25 Hz
+// Around where an object is expected: 10 m/s^2 at 0.6 m is 8 px a frame at 25 Hz. What leaps further is found
+// where it was (TagDetector) or by a scan.
+constexpr double kObjectMarginPx = 12;
 constexpr double kGroundMarginPx = 6;
 constexpr int kSlowScan = 4;  // what is missing for long is looked for in each camera every so many frames
 
@@ -34,7 +39,7 @@ cv::Rect Appearance(const CameraModel& camera, const Pose& X_CT, double size, do
   for (const Eigen::Vector3d& p : TagPoints(size * 1.25)) {
     const Eigen::Vector3d p_C = X_CT * p;
     if (!(p_C.z() > 0.02)) return {};
-    const Eigen::Vector2d uv = camera.Project(p_C);
+    const Eigen::Vector2d uv = camera.Distort(camera.Project(p_C));
     lo = lo.cwiseMin(uv);
     hi = hi.cwiseMax(uv);
   }
@@ -47,7 +52,8 @@ cv::Rect Appearance(const CameraModel& camera, const Pose& X_CT, double size, do
 
 }  // namespace
 
-Pipeline::Pipeline(PerceptionConfig config) : config_(std::move(config)) {
+Pipeline::Pipeline(PerceptionConfig config, const PipelineOptions& options)
+    : config_(std::move(config)), options_(options) {
   Check(config_);
   Reset();
 }
@@ -58,18 +64,22 @@ void Pipeline::Reset() {
   for (const ObjectModel& o : config_.objects) {
     for (const ObjectTag& t : o.tags) ids.push_back(t.id);
   }
+  tracks_.assign(config_.objects.size(), {});
+  pose_tracks_.assign(config_.objects.size(), {});
+  records_.clear();
+  const DetectorOptions detector{.threads = options_.threads, .budget_px = kBudgetPx};
   cameras_.clear();
   for (size_t c = 0; c < config_.cameras.size(); ++c) {
-    Camera& camera = cameras_.emplace_back(config_.cameras[c], TagDetector(ids));
+    Camera& camera = cameras_.emplace_back(config_.cameras[c], TagDetector(ids, detector));
     camera.X_WC = camera.model.X_WC;
   }
-  tracks_.fill({});
   seq_ = 0;
 }
 
 void Pipeline::RedoExtrinsics() {
   for (Camera& camera : cameras_) {
     camera.X_WC = camera.model.X_WC;
+    camera.information.reset();
     camera.ground_frames = 0;
     camera.in_place = true;
   }
@@ -95,6 +105,9 @@ void Pipeline::Place(Camera& camera) {
       if (RmsDistance(mean, tag->corners) > kSameGroundPx) camera.ground_frames = 0;
     }
     if (camera.ground_frames == 0) camera.ground_sum.fill(Eigen::Vector2d::Zero());
+    // Of one frame, not of their mean: the corners of a tag that stands still err alike in all of them.
+    const double sigma = config_.corner_sigma_px;
+    const Matrix8d covariance = tag->covariance + sigma * sigma * Matrix8d::Identity();
     ++camera.ground_frames;
     TagCorners mean;
     for (int k = 0; k < 4; ++k) {
@@ -105,10 +118,21 @@ void Pipeline::Place(Camera& camera) {
     const bool clear =
         pose.ambiguity <= kGroundAmbiguity || AngleBetween(pose.X_CT[0].q, pose.X_CT[1].q) < kGroundSame;
     if (pose.ok && clear) {
-      camera.X_WC = ground.X_WT * pose.X_CT[0].Inverse();
+      const PlacedCamera here{&camera.model, Pose{}};
+      std::array<PointView, 4> points;
+      for (int k = 0; k < 4; ++k) points[k] = {TagPoints(ground.size)[k], mean[k], 0};
+      const Matrix8d weight = Whitening(covariance);
+      const PoseFit fit = FitPose({&here, 1}, points, pose.X_CT[0], {&weight, 1});
+      camera.X_WC = ground.X_WT * fit.X_WO.Inverse();
+      // X_WC Exp(e) = X_WT X_CT'^-1 for X_CT' = (Exp(w) R_CT, p_CT + dp): w = -e_r, dp = p_CT x e_r - e_p.
+      const Eigen::Vector3d& p = fit.X_WO.p;
+      Matrix6d to_motion = -Matrix6d::Identity();
+      to_motion.bottomLeftCorner<3, 3>() << 0, -p.z(), p.y(), p.z(), 0, -p.x(), -p.y(), p.x(), 0;
+      camera.information = to_motion.transpose() * fit.information * to_motion;
     } else {
       camera.ground_frames = 0;
       camera.X_WC.reset();
+      camera.information.reset();
     }
     return;
   }
@@ -128,10 +152,12 @@ std::vector<cv::Rect> Pipeline::Expected(const Camera& camera, int64_t exposure_
     if (!r.empty()) regions.push_back(r);
   };
   if (config_.ground) add(config_.ground->X_WT, config_.ground->size, kGroundMarginPx);
-  for (const ObjectModel& o : config_.objects) {
-    const Track& track = tracks_[o.slot];
+  for (size_t i = 0; i < tracks_.size(); ++i) {
+    const Track& track = tracks_[i];
     if (!track.seen || exposure_us - track.seen_us > kHoldUs) continue;
-    for (const ObjectTag& t : o.tags) add(track.X_WO * t.X_OT, t.size, kObjectMarginPx);
+    const auto predicted = pose_tracks_[i].Predicted(1e-6 * static_cast<double>(exposure_us));
+    const Pose X_WO = predicted.value_or(track.X_WO);
+    for (const ObjectTag& t : config_.objects[i].tags) add(X_WO * t.X_OT, t.size, kObjectMarginPx);
   }
   return regions;
 }
@@ -141,10 +167,15 @@ bool Pipeline::ScanDue(int camera) const {
   const int n = static_cast<int>(cameras_.size());
   if (!cameras_[camera].X_WC) return seq_ % kSlowScan == camera % kSlowScan;
   bool slow = false;
+  std::array<int, kMaxObjects> missing_frames;
+  missing_frames.fill(std::numeric_limits<int>::max());
+  for (size_t i = 0; i < tracks_.size(); ++i) {
+    int& missing = missing_frames[config_.objects[i].slot];
+    missing = std::min(missing, tracks_[i].missing_frames);
+  }
   for (const ObjectModel& o : config_.objects) {
-    const Track& track = tracks_[o.slot];
-    if (track.missing_frames == 0) continue;
-    if (track.missing_frames <= kSlowScan * n) return seq_ % n == camera;
+    if (missing_frames[o.slot] == 0) continue;
+    if (missing_frames[o.slot] <= kSlowScan * n) return seq_ % n == camera;
     slow = true;
   }
   return slow && seq_ % (kSlowScan * n) == kSlowScan * camera;
@@ -165,7 +196,10 @@ void Pipeline::Process(const GrayImages& images, int64_t frame_seq, int64_t expo
                                std::to_string(model.height));
     }
   }
-  if (seq_ == 0 || exposure_us < last_us_) tracks_.fill({});
+  if (seq_ == 0 || exposure_us < last_us_) {
+    tracks_.assign(tracks_.size(), {});
+    pose_tracks_.assign(pose_tracks_.size(), {});
+  }
   last_us_ = exposure_us;
   ++seq_;
 
@@ -174,6 +208,11 @@ void Pipeline::Process(const GrayImages& images, int64_t frame_seq, int64_t expo
     const auto start = std::chrono::steady_clock::now();
     camera.seen =
         camera.detector.Detect(images[c], Expected(camera, exposure_us), ScanDue(static_cast<int>(c)));
+    if (camera.model.distorted()) {
+      for (SeenTag& tag : camera.seen) {
+        for (Eigen::Vector2d& corner : tag.corners) corner = camera.model.Undistort(corner);
+      }
+    }
     camera.detect_us =
         std::chrono::duration<double, std::micro>(std::chrono::steady_clock::now() - start).count();
     Place(camera);
@@ -187,11 +226,11 @@ void Pipeline::Process(const GrayImages& images, int64_t frame_seq, int64_t expo
   for (size_t c = cameras_.size(); c < detections.size(); ++c) detections[c] = TagDetections{};
 
   // Poses of single tags: for the message, and as starts of the joint solve.
-  std::array<std::vector<TagView>, kMaxObjects> views;
+  std::vector<std::vector<TagView>> views(config_.objects.size());  // one an object
   std::vector<PlacedCamera> placed;
   for (size_t c = 0; c < cameras_.size(); ++c) {
     const Camera& camera = cameras_[c];
-    placed.push_back({&camera.model, camera.X_WC.value_or(Pose{})});
+    placed.push_back({&camera.model, camera.X_WC.value_or(Pose{}), camera.information});
     for (const SeenTag& tag : camera.seen) {
       const bool is_ground = config_.ground && config_.ground->id == tag.id;
       const ObjectModel* object = nullptr;
@@ -210,14 +249,15 @@ void Pipeline::Process(const GrayImages& images, int64_t frame_seq, int64_t expo
       if (pose.ok && d.n < kMaxTags) {
         TagDetection& m = d.tags[d.n++];
         m.id = tag.id;
-        for (int k = 0; k < 4; ++k) m.corners[k] = tag.corners[k].cast<float>();
+        for (int k = 0; k < 4; ++k) m.corners[k] = camera.model.Distort(tag.corners[k]).cast<float>();
         m.X_CT = pose.X_CT;
         for (int i = 0; i < 2; ++i) m.reprojection_px[i] = static_cast<float>(pose.reprojection_px[i]);
         m.ambiguity = static_cast<float>(pose.ambiguity);
         m.decision_margin = tag.decision_margin;
       }
       if (object && camera.X_WC && camera.in_place) {
-        views[object->slot].push_back({static_cast<int>(c), place->size, place->X_OT, tag.corners, pose});
+        views[object - config_.objects.data()].push_back(
+            {static_cast<int>(c), place->size, place->X_OT, tag.corners, pose, tag.covariance});
       }
     }
   }
@@ -227,27 +267,70 @@ void Pipeline::Process(const GrayImages& images, int64_t frame_seq, int64_t expo
   out.seq = seq_;
   out.frame_seq = frame_seq;
   const ObjectSolverLimits limits{.corner_sigma_px = config_.corner_sigma_px};
-  for (const ObjectModel& o : config_.objects) {
-    Track& track = tracks_[o.slot];
-    TrackedObject& object = out.objects[o.slot];
-    const ObjectFit fit = SolveObject(placed, std::move(views[o.slot]), limits);
-    if (fit.valid) {
-      track.X_WO = fit.X_WO;
-      track.covariance = PackCovariance(fit.covariance);
-      track.seen = true;
-      track.seen_us = exposure_us;
-      track.missing_frames = 0;
-      object.cameras = fit.cameras;
-    } else {
-      ++track.missing_frames;
-    }
-    if (!track.seen) continue;
-    object.id = o.id;
-    object.X_WO = track.X_WO;
-    object.covariance = track.covariance;
-    object.age = static_cast<float>(1e-6 * (exposure_us - track.seen_us));
-    object.valid = exposure_us - track.seen_us <= kHoldUs;
+  if (options_.revisable) records_.push_back({out, std::vector<Sight>(tracks_.size())});
+  for (size_t i = 0; i < tracks_.size(); ++i) {
+    ObjectFit fit = SolveObject(placed, std::move(views[i]), limits);
+    const Sight sight{std::move(fit.minima), fit.rms_px <= limits.max_rms_px};
+    const auto evidence = pose_tracks_[i].Update(1e-6 * static_cast<double>(exposure_us), sight.poses);
+    Report(config_.objects[i], sight, evidence, tracks_[i], out);
+    if (options_.revisable) records_.back().sights[i] = sight;
   }
+}
+
+void Pipeline::Report(const ObjectModel& model, const Sight& sight, const PoseTrack::Evidence& evidence,
+                      Track& track, ObjectPoses& out) {
+  const int64_t exposure_us = out.exposure_utime;
+  const Verdict verdict = Judge(evidence);
+  // Of cameras that contradict each other one may be believed when it goes on where both were.
+  const bool believed =
+      verdict.hypothesis >= 0 && verdict.p_wrong <= kMaxWrong && (sight.agreed || evidence.continues);
+  uint8_t cameras = 0;
+  if (believed) {
+    const ObjectPose& chosen = sight.poses[verdict.hypothesis];
+    track.X_WO = chosen.X_WO;
+    track.covariance =
+        PackCovariance(sight.agreed && sight.poses.size() == 2
+                           ? CovarianceOfChoice(chosen, sight.poses[1 - verdict.hypothesis], verdict.p_wrong)
+                           : chosen.covariance);
+    track.seen = true;
+    track.seen_us = exposure_us;
+    track.missing_frames = 0;
+    cameras = chosen.cameras;
+  } else {
+    ++track.missing_frames;
+  }
+  TrackedObject& object = out.objects[model.slot];
+  const auto age = static_cast<float>(1e-6 * static_cast<double>(exposure_us - track.seen_us));
+  if (!track.seen || (object.id >= 0 && object.age <= age)) return;
+  object.id = model.id;
+  object.X_WO = track.X_WO;
+  object.covariance = track.covariance;
+  object.cameras = cameras;
+  object.age = age;
+  object.valid = exposure_us - track.seen_us <= kHoldUs;
+}
+
+std::vector<ObjectPoses> Pipeline::Revised() const {
+  std::vector<ObjectPoses> out;
+  // A step back in time parts two runs that have nothing to do with each other.
+  for (size_t begin = 0, end = 0; begin < records_.size(); begin = end) {
+    std::vector<double> time_s;
+    for (end = begin; end < records_.size(); ++end) {
+      if (end > begin && records_[end].head.exposure_utime < records_[end - 1].head.exposure_utime) break;
+      time_s.push_back(1e-6 * static_cast<double>(records_[end].head.exposure_utime));
+      out.push_back(records_[end].head);
+    }
+    for (size_t i = 0; i < config_.objects.size(); ++i) {
+      std::vector<std::vector<ObjectPose>> poses;
+      for (size_t r = begin; r < end; ++r) poses.push_back(records_[r].sights[i].poses);
+      const auto evidence = PoseTrack::Revise(time_s, poses);
+      Track track;
+      for (size_t r = begin; r < end; ++r) {
+        Report(config_.objects[i], records_[r].sights[i], evidence[r - begin], track, out[r]);
+      }
+    }
+  }
+  return out;
 }
 
 void RgbToGray(const cv::Mat& rgb, cv::Mat& gray) { cv::cvtColor(rgb, gray, cv::COLOR_RGB2GRAY); }

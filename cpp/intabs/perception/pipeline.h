@@ -14,11 +14,17 @@
 #include "intabs/perception/config.h"
 #include "intabs/perception/detector.h"
 #include "intabs/perception/object_solver.h"
+#include "intabs/perception/pose_track.h"
 
 namespace intabs {
 
 using GrayImages = std::vector<cv::Mat>;  // one a camera, (H, W) CV_8UC1; empty: this camera gave nothing
 using CameraDetections = std::array<TagDetections, kMaxCameras>;
+
+struct PipelineOptions {
+  int threads = 1;         // of the tag detector
+  bool revisable = false;  // remember what Revised() needs
+};
 
 class Pipeline {
  public:
@@ -28,11 +34,18 @@ class Pipeline {
   // The camera's place is the mean over so many frames of the ground tag, then fixed.
   static constexpr int kGroundFrames = 10;
 
-  explicit Pipeline(PerceptionConfig config);  // throws what Check() throws
+  // Of the tag detector, a camera and frame: 640 x 480 costs this much looked at as a whole after regions and
+  // a decimated scan found a tag gone, larger pictures are searched in parts.
+  static constexpr int64_t kBudgetPx = 450000;
 
-  // out: every configured object, in its slot.
-  //   Seen: pose and covariance of this frame, cameras that contributed, age 0, valid.
-  //   Not seen, or its views contradict each other: the last pose with age growing, cameras 0; valid up to an
+  explicit Pipeline(PerceptionConfig config,
+                    const PipelineOptions& options = {});  // throws what Check() throws
+
+  // out: every configured object, in its slot; of several that name the same slot the one seen last.
+  //   Seen: pose and covariance of this frame, cameras that contributed, age 0, valid. Which of two poses it
+  //   is, and
+  //     whether this frame can be believed, is told by all frames so far (PoseTrack).
+  //   Not seen, not believed, or still ambiguous: the last pose with age growing, cameras 0; valid up to an
   //   age of
   //     kHoldUs, invalid after it (the pose is kept, the age grows on).
   //   Never seen: as an unused slot (id -1, null pose, invalid, age 0).
@@ -43,6 +56,10 @@ class Pipeline {
   // configuration.
   void Process(const GrayImages& images, int64_t frame_seq, int64_t exposure_us, ObjectPoses& out,
                CameraDetections& detections);
+
+  // The poses of all frames since the last Reset(), decided anew with those after them in view. Only with
+  // PipelineOptions::revisable, else empty.
+  std::vector<ObjectPoses> Revised() const;
 
   void Reset();           // as new
   void RedoExtrinsics();  // finds the places of the cameras anew; poses are kept
@@ -61,11 +78,12 @@ class Pipeline {
     CameraModel model;
     TagDetector detector;
     std::optional<Pose> X_WC;
+    std::optional<Matrix6d> information{};  // of X_WC (PlacedCamera); unset: from a calibration
     int ground_frames = 0;
     TagCorners ground_sum;
     bool in_place = true;
     double detect_us = 0;
-    std::vector<SeenTag> seen;
+    std::vector<SeenTag> seen;  // corners in ideal pixels (camera_model.h)
   };
   struct Track {
     Pose X_WO;
@@ -74,6 +92,18 @@ class Pipeline {
     int64_t seen_us = 0;
     int missing_frames = 0;  // since it was seen last
   };
+  // What a frame shows of one object.
+  struct Sight {
+    std::vector<ObjectPose> poses;  // ObjectFit::minima
+    bool agreed = false;            // by all cameras
+  };
+  struct Record {
+    ObjectPoses head;  // stamps alone
+    std::vector<Sight> sights;
+  };
+
+  static void Report(const ObjectModel& model, const Sight& sight, const PoseTrack::Evidence& evidence,
+                     Track& track, ObjectPoses& out);
 
   void Place(Camera& camera);
   bool ScanDue(int camera) const;
@@ -81,7 +111,10 @@ class Pipeline {
 
   PerceptionConfig config_;
   std::vector<Camera> cameras_;
-  std::array<Track, kMaxObjects> tracks_;
+  PipelineOptions options_;
+  std::vector<Track> tracks_;           // one a configured object
+  std::vector<PoseTrack> pose_tracks_;  // likewise
+  std::vector<Record> records_;
   int64_t seq_ = 0;
   int64_t last_us_ = 0;
 };

@@ -17,7 +17,9 @@ using TagPattern = std::array<float, 100>;
 
 // gray: CV_8UC1. corners: AprilTag's in, refined out. False, with the corners untouched, where the picture
 // does not look like the tag (a hand or finger in front of it) or the fit leads away. Gauss-Newton with
-// robust weights; deterministic.
-bool RefineCorners(const cv::Mat& gray, const TagPattern& pattern, TagCorners& corners);
+// robust weights; deterministic. covariance (px^2; of the corners' coordinates u0 v0 u1 ...): out, from the
+// fit's residuals; large tags have better corners than small ones, and a tag's corners err together.
+bool RefineCorners(const cv::Mat& gray, const TagPattern& pattern, TagCorners& corners,
+                   Matrix8d* covariance = nullptr);
 
 }  // namespace intabs

@@ -63,13 +63,13 @@ TEST_CASE("What is written into the ring is read from it, camera by camera") {
   CHECK(reader.newest_seq() == 1);
 
   Frame frame;
-  REQUIRE(reader.Read(1, 0, frame));
+  REQUIRE(reader.Read(1, 0, frame) == FrameRead::kWhole);
   CHECK(frame.frame_seq == 1);
   CHECK(frame.exposure_us == 1000);
   REQUIRE(frame.rgb.rows == 11);
   REQUIRE(frame.rgb.cols == 37);
   CHECK(std::equal(rgb.begin(), rgb.end(), frame.rgb.data));
-  REQUIRE(reader.Read(1, 1, frame));
+  REQUIRE(reader.Read(1, 1, frame) == FrameRead::kWhole);
   CHECK(frame.exposure_us == 1001);
   CHECK(std::equal(other.begin(), other.end(), frame.rgb.data));
 }
@@ -79,18 +79,18 @@ TEST_CASE("Frames that are not written yet, overwritten already, or of no camera
   FrameRingWriter writer(name, kCameras, 16, 8, 3);
   const FrameRingReader reader(name);
   Frame frame;
-  CHECK_FALSE(reader.Read(0, 0, frame));
-  CHECK_FALSE(reader.Read(1, 0, frame));
+  CHECK(reader.Read(0, 0, frame) == FrameRead::kAbsent);
+  CHECK(reader.Read(1, 0, frame) == FrameRead::kAbsent);
   for (int seq = 1; seq <= 4; ++seq) writer.Write(0, seq, seq, Picture(16, 8, seq).data());
-  CHECK_FALSE(reader.Read(1, 0, frame));  // 4 lies in its slot
-  CHECK(reader.Read(2, 0, frame));
-  CHECK(reader.Read(4, 0, frame));
+  CHECK(reader.Read(1, 0, frame) == FrameRead::kAbsent);  // 4 lies in its slot
+  CHECK(reader.Read(2, 0, frame) == FrameRead::kWhole);
+  CHECK(reader.Read(4, 0, frame) == FrameRead::kWhole);
   CHECK(frame.rgb.data[0] == 4);
-  CHECK_FALSE(reader.Read(5, 0, frame));
-  CHECK_FALSE(reader.Read(4, 1, frame));
-  CHECK_FALSE(reader.Read(4, 2, frame));
-  CHECK_FALSE(reader.Read(4, -1, frame));
-  CHECK_FALSE(reader.Read(-2, 0, frame));
+  CHECK(reader.Read(5, 0, frame) == FrameRead::kAbsent);
+  CHECK(reader.Read(4, 1, frame) == FrameRead::kAbsent);
+  CHECK(reader.Read(4, 2, frame) == FrameRead::kAbsent);
+  CHECK(reader.Read(4, -1, frame) == FrameRead::kAbsent);
+  CHECK(reader.Read(-2, 0, frame) == FrameRead::kAbsent);
 }
 
 TEST_CASE("A frame that is overwritten while it is copied is not taken for a whole one") {
@@ -111,7 +111,7 @@ TEST_CASE("A frame that is overwritten while it is copied is not taken for a who
   int whole = 0, wrong = 0;
   while (whole < 500) {
     const int64_t seq = reader.newest_seq();
-    if (!reader.Read(seq, 0, frame)) continue;
+    if (reader.Read(seq, 0, frame) != FrameRead::kWhole) continue;
     ++whole;
     const uint8_t* end = frame.rgb.data + size_t{3} * kWidth * kHeight;
     const bool same =
@@ -121,6 +121,25 @@ TEST_CASE("A frame that is overwritten while it is copied is not taken for a who
   stop = true;
   thread.join();
   CHECK(wrong == 0);
+}
+
+TEST_CASE("A frame that its writer has begun and not ended is torn, not whole") {
+  const std::string name = RingName();
+  FrameRingWriter writer(name, {"only"}, 16, 8, 2);
+  const FrameRingReader reader(name);
+  writer.Write(0, 3, 1, Picture(16, 8, 5).data());
+  Frame frame;
+  REQUIRE(reader.Read(3, 0, frame) == FrameRead::kWhole);
+  const int fd = shm_open(name.c_str(), O_RDWR, 0);
+  REQUIRE(fd >= 0);
+  const off_t version = 256 + 64 * (3 % 2);  // the header, then a slot a frame
+  int64_t value = 0;
+  REQUIRE(pread(fd, &value, sizeof(value), version) == sizeof(value));
+  REQUIRE(value == 2);
+  value = 3;
+  REQUIRE(pwrite(fd, &value, sizeof(value), version) == sizeof(value));
+  close(fd);
+  CHECK(reader.Read(3, 0, frame) == FrameRead::kTorn);
 }
 
 TEST_CASE("Without a ring the reader says so in one line") {
@@ -138,7 +157,7 @@ TEST_CASE("The ring goes with its writer; a reader that has it keeps the last fr
   writer.reset();
   CHECK_FALSE(Exists(name));
   Frame frame;
-  CHECK(reader.Read(1, 0, frame));
+  CHECK(reader.Read(1, 0, frame) == FrameRead::kWhole);
 }
 
 TEST_CASE("A killed writer's ring is replaced; that of a running one is not") {
@@ -173,7 +192,7 @@ TEST_CASE("A killed writer's ring is replaced; that of a running one is not") {
     const FrameRingReader reader(name);
     CHECK(reader.width() == 16);
     Frame frame;
-    CHECK(reader.Read(1, 0, frame));
+    CHECK(reader.Read(1, 0, frame) == FrameRead::kWhole);
   }
   CHECK_FALSE(Exists(name));
 }

@@ -1,8 +1,10 @@
+#include <algorithm>
 #include <catch2/catch.hpp>
 #include <cmath>
 #include <opencv2/core.hpp>
 
 #include "intabs/perception/detector.h"
+#include "intabs/perception/object_solver.h"
 #include "intabs/perception/refine.h"
 #include "intabs/perception/tag_pose.h"
 #include "perception/synthetic.h"
@@ -135,6 +137,85 @@ TEST_CASE("Refined corners of small oblique tags lie within hundredths of a pixe
   CHECK(std::sqrt(square / n) < 0.08);
 }
 
+TEST_CASE("Refined corners say how far they are off, near and far, face on and oblique") {
+  const CameraModel camera = VgaCamera("c", Pose{});
+  for (const double distance : {0.35, 0.6, 1.0, 1.4}) {
+    cv::RNG rng(37);
+    int inside = 0, n = 0;
+    for (int i = 0; i < 60; ++i) {
+      const Pose X_CT = Facing(rng, distance, Uniform(rng, 0, 1.0));
+      const TagCorners truth = Projected(camera, X_CT, 0.05);
+      TagCorners corners = truth;
+      for (Eigen::Vector2d& c : corners) c += Eigen::Vector2d(Uniform(rng, -.7, .7), Uniform(rng, -.7, .7));
+      Matrix8d covariance;
+      if (!RefineCorners(View(camera, {{7, {X_CT, 0.05}}}, i), test::Pattern(7), corners, &covariance))
+        continue;
+      Eigen::Matrix<double, 8, 1> e;
+      for (int k = 0; k < 4; ++k) e.segment<2>(2 * k) = corners[k] - truth[k];
+      inside += (Whitening(covariance) * e).squaredNorm() < 15.507;  // chi-square, 8 degrees of freedom, 95 %
+      ++n;
+    }
+    INFO(distance << " m: " << inside << " of " << n << " inside the 95 % ellipsoid");
+    CHECK(n >= 55);
+    CHECK(inside >= .85 * n);
+  }
+}
+
+TEST_CASE("Small tags turn up within a round of scans, though halved they are too small") {
+  const CameraModel camera = VgaCamera("c", Pose{});
+  cv::RNG rng(41);
+  int n = 0, later = 0;
+  for (int i = 0; i < 12; ++i) {
+    const double x = Uniform(rng, -.4, .4), y = Uniform(rng, -.6, .6);
+    const Pose X_CT{{x, y, 2.2}, ExpSO3({Uniform(rng, -.2, .2), Uniform(rng, -.2, .2), Uniform(rng, 0, 6)})};
+    const cv::Mat image = View(camera, {{7, {X_CT, 0.05}}}, i);
+    TagDetector whole({7}), scanning({7}, {.budget_px = 200000});
+    if (whole.Detect(image, {}, true).empty()) continue;
+    scanning.Detect(View(camera, {}, 100), {}, true);
+    int scans = 1;
+    while (scanning.Detect(image, {}, true).empty() && scans <= 4) ++scans;
+    INFO("view " << i);
+    CHECK(scans <= 4);
+    ++n;
+    later += scans > 1;
+  }
+  CHECK(n >= 8);
+  CHECK(later >= 2);  // else the halved picture showed them all
+}
+
+TEST_CASE("A frame's budget is kept, and every tag gets its turn") {
+  const CameraModel camera = VgaCamera("c", Pose{});
+  test::Scene scene;
+  for (int i = 0; i < 4; ++i) scene[7 + i] = {{{-.25 + .17 * i, .1 * (i % 2), .8}, ExpSO3({.3, .2, 0})}, .05};
+  TagDetector detector({}, {.budget_px = 12000});  // a region is about 9000
+  REQUIRE(detector.Detect(View(camera, scene, 1), {}, true).size() == 4);
+  std::vector<cv::Rect> expected;
+  for (const auto& [id, tag] : scene) {
+    const auto corners = Projected(camera, tag.X_WT, tag.size);
+    expected.emplace_back(cv::Point(corners[3].x() - 30, corners[3].y() - 30), cv::Size(95, 95));
+  }
+  std::vector<int> seen(20, 0);
+  for (int frame = 0; frame < 8; ++frame) {
+    const auto& tags = detector.Detect(View(camera, scene, 2 + frame), expected, true);
+    CHECK(tags.size() == 1);
+    for (const SeenTag& t : tags) ++seen.at(t.id);
+  }
+  for (const auto& [id, tag] : scene) CHECK(seen[id] == 2);
+}
+
+TEST_CASE("Several threads find what one finds") {
+  const CameraModel camera = VgaCamera("c", Pose{});
+  cv::RNG rng(43);
+  for (int i = 0; i < 5; ++i) {
+    const cv::Mat image = View(camera, {{7, {Facing(rng, .6, .5), 0.05}}}, i);
+    TagDetector one({}), two({}, {.threads = 2});
+    const auto a = one.Detect(image, {}, true), b = two.Detect(image, {}, true);
+    REQUIRE(a.size() == 1);
+    REQUIRE(b.size() == 1);
+    for (int k = 0; k < 4; ++k) CHECK((a[0].corners[k] - b[0].corners[k]).norm() < .01);
+  }
+}
+
 TEST_CASE("Corners are left alone where the picture is not that tag") {
   const CameraModel camera = VgaCamera("c", Pose{});
   const Pose X_CT{{0, 0, .6}, ExpSO3({.4, .2, .3})};
@@ -187,8 +268,8 @@ TEST_CASE("The solver's Jacobian is the derivative of the reprojection") {
       points.push_back({p, cameras[c].model->Project(cameras[c].X_WC.Inverse() * (X_WO * p)), c});
     }
   }
-  const PoseFit fit =
-      FitPose(cameras, points, {X_WO.p + Eigen::Vector3d(.02, -.01, .02), X_WO.q * ExpSO3({.1, .1, .1})});
+  const Pose start{X_WO.p + Eigen::Vector3d(.02, -.01, .02), X_WO.q * ExpSO3({.1, .1, .1})};
+  const PoseFit fit = FitPose(cameras, points, start);
   REQUIRE(fit.ok);
   CHECK((fit.X_WO.p - X_WO.p).norm() < 1e-8);
   CHECK(AngleBetween(fit.X_WO.q, X_WO.q) < 1e-7);
@@ -204,4 +285,58 @@ TEST_CASE("The solver's Jacobian is the derivative of the reprojection") {
       CHECK(fit.information(i, j) == Approx(second).epsilon(1e-3).margin(1e-3 * fit.information.norm()));
     }
   }
+}
+
+TEST_CASE("Where a camera is known to stand only roughly, the pose says so and stays right") {
+  // The right camera stands 2 mm and 0.3 deg off its place, in any direction.
+  const CameraModel left = VgaCamera("l", LookAt({.8, .4, .5}, {.3, 0, 0}));
+  const CameraModel right = VgaCamera("r", LookAt({.8, -.4, .5}, {.3, 0, 0}));
+  const double sigma_p = .002, sigma_r = .3 * M_PI / 180, sigma_px = .05;
+  Vector6d sigma;
+  sigma << Eigen::Vector3d::Constant(sigma_r), Eigen::Vector3d::Constant(sigma_p);
+  std::vector<PlacedCamera> placed{{&left, *left.X_WC}, {&right, *right.X_WC}};
+  std::vector<PlacedCamera> uncertain = placed;
+  uncertain[1].information = sigma.array().square().inverse().matrix().asDiagonal();
+  cv::RNG rng(47);
+  const auto draw = [&](double s) {
+    return Eigen::Vector3d(rng.gaussian(s), rng.gaussian(s), rng.gaussian(s));
+  };
+  int inside = 0, inside_without = 0;
+  const int n = 300;
+  std::vector<double> mm;
+  for (int i = 0; i < n; ++i) {
+    const Pose X_WO{Eigen::Vector3d(.3, 0, .02) + draw(.03),
+                    ExpSO3(draw(.3)) * Eigen::Quaterniond(0, 1, 0, 0)};
+    const std::array<Pose, 2> stands{*left.X_WC,
+                                     {right.X_WC->p + sigma_p * draw(1).normalized(),
+                                      right.X_WC->q * ExpSO3(sigma_r * draw(1).normalized())}};
+    std::vector<TagView> views;
+    for (int c = 0; c < 2; ++c) {
+      TagView view{c, .04, Pose{}, {}, {}, sigma_px * sigma_px * Matrix8d::Identity()};
+      for (int k = 0; k < 4; ++k) {
+        view.corners[k] = placed[c].model->Project(stands[c].Inverse() * (X_WO * TagPoints(.04)[k])) +
+                          Eigen::Vector2d(rng.gaussian(sigma_px), rng.gaussian(sigma_px));
+      }
+      view.hypotheses = SolveTag(*placed[c].model, .04, view.corners);
+      views.push_back(view);
+    }
+    const auto chi2 = [&](const ObjectPose& got) {
+      Vector6d e;
+      e << LogSO3(X_WO.q * got.X_WO.q.conjugate()), X_WO.p - got.X_WO.p;
+      return e.dot(got.covariance.ldlt().solve(e));
+    };
+    const ObjectFit fit = SolveObject(uncertain, views, {});
+    REQUIRE(fit.valid);
+    CHECK(AngleBetween(fit.minima[0].X_WO.q, X_WO.q) < 10 * M_PI / 180);
+    mm.push_back(1e3 * (fit.minima[0].X_WO.p - X_WO.p).norm());
+    inside += chi2(fit.minima[0]) < 12.592;
+    const ObjectFit sure = SolveObject(placed, views, {});
+    inside_without += sure.valid && chi2(sure.minima[0]) < 12.592;
+  }
+  std::sort(mm.begin(), mm.end());
+  INFO(inside << " of " << n << " inside the 95 % ellipsoid (" << inside_without << " when sure), p95 "
+              << mm[n * 95 / 100] << " mm");
+  CHECK(inside >= .9 * n);
+  CHECK(inside_without < .5 * n);
+  CHECK(mm[n * 95 / 100] < 2.5);
 }

@@ -1,0 +1,14 @@
+#pragma once
+
+#include <memory>
+#include <string>
+
+#include "intabs/camera/frame_source.h"
+
+namespace intabs {
+
+// Colour frames of the RealSense camera with that serial number; empty: any. Throws when there is none, or
+// this build has no librealsense2.
+std::unique_ptr<FrameSource> OpenRealSense(const std::string& serial, const CameraRequest& camera);
+
+}  // namespace intabs
