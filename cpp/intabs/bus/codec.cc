@@ -187,6 +187,9 @@ void ToLcm(const PlantTruth& m, intabs_lcm::plant_truth_t& l) {
   l.subgoals = static_cast<int32_t>(m.subgoals);
   l.success = m.success;
   l.state_hash = static_cast<int64_t>(m.state_hash);
+  std::copy(m.touches.begin(), m.touches.end(), l.touches);
+  std::copy(m.beads_in.begin(), m.beads_in.end(), l.beads_in);
+  l.beads = m.beads;
 }
 // What the plant says of an object is exact and new, which the message does not repeat: valid, age 0, no
 // covariance.
@@ -204,6 +207,9 @@ bool FromLcm(const intabs_lcm::plant_truth_t& l, PlantTruth& m) {
   m.subgoals = static_cast<uint32_t>(l.subgoals);
   m.success = l.success != 0;
   m.state_hash = static_cast<uint64_t>(l.state_hash);
+  std::copy(std::begin(l.touches), std::end(l.touches), m.touches.begin());
+  std::copy(std::begin(l.beads_in), std::end(l.beads_in), m.beads_in.begin());
+  m.beads = l.beads;
   return true;
 }
 
@@ -347,6 +353,8 @@ void ToLcm(const PerceptionStatus& m, intabs_lcm::perception_status_t& l) {
   std::copy(m.frames.begin(), m.frames.end(), l.frames);
   std::copy(m.dropped.begin(), m.dropped.end(), l.dropped);
   std::copy(m.late.begin(), m.late.end(), l.late);
+  std::copy(m.doubled.begin(), m.doubled.end(), l.doubled);
+  std::copy(m.torn.begin(), m.torn.end(), l.torn);
   std::copy(m.fps.begin(), m.fps.end(), l.fps);
   std::copy(m.detect_us_p50.begin(), m.detect_us_p50.end(), l.detect_us_p50);
   std::copy(m.detect_us_p95.begin(), m.detect_us_p95.end(), l.detect_us_p95);
@@ -358,6 +366,8 @@ bool FromLcm(const intabs_lcm::perception_status_t& l, PerceptionStatus& m) {
   std::copy(std::begin(l.frames), std::end(l.frames), m.frames.begin());
   std::copy(std::begin(l.dropped), std::end(l.dropped), m.dropped.begin());
   std::copy(std::begin(l.late), std::end(l.late), m.late.begin());
+  std::copy(std::begin(l.doubled), std::end(l.doubled), m.doubled.begin());
+  std::copy(std::begin(l.torn), std::end(l.torn), m.torn.begin());
   std::copy(std::begin(l.fps), std::end(l.fps), m.fps.begin());
   std::copy(std::begin(l.detect_us_p50), std::end(l.detect_us_p50), m.detect_us_p50.begin());
   std::copy(std::begin(l.detect_us_p95), std::end(l.detect_us_p95), m.detect_us_p95.begin());

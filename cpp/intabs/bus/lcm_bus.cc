@@ -50,6 +50,11 @@ void Dispatch(const lcm_recv_buf_t* received, const char*, void* handler) {
                                               received->data_size);
 }
 
+void DispatchAny(const lcm_recv_buf_t* received, const char* channel, void* handler) {
+  (*static_cast<LcmBus::AnyHandler*>(handler))(
+      received->recv_utime, channel, static_cast<const uint8_t*>(received->data), received->data_size);
+}
+
 }  // namespace
 
 LcmBus::LcmBus(const std::string& url, std::string prefix) : Bus(std::move(prefix)) {
@@ -86,6 +91,13 @@ void LcmBus::SubscribeBytes(const std::string& channel, BytesHandler handler) {
   if (s == nullptr) throw std::runtime_error("LCM does not subscribe to " + prefix_ + channel);
   // A full queue drops what comes in, not what is old: let it hold whatever one Handle() hands out.
   lcm_subscription_set_queue_capacity(s, kMaxBatch);
+}
+
+void LcmBus::SubscribeAll(AnyHandler handler) {
+  any_handlers_.push_back(std::make_unique<AnyHandler>(std::move(handler)));
+  lcm_subscription_t* s = lcm_subscribe(lcm_, ".*", &DispatchAny, any_handlers_.back().get());
+  if (s == nullptr) throw std::runtime_error("LCM does not subscribe to all channels");
+  lcm_subscription_set_queue_capacity(s, 10 * kMaxBatch);
 }
 
 }  // namespace intabs

@@ -24,11 +24,18 @@ class LcmBus final : public Bus {
   bool PublishBytes(const std::string& channel, const uint8_t* data, size_t size) override;
   void SubscribeBytes(const std::string& channel, BytesHandler handler) override;
 
+  // Every channel there is, of any prefix, under its full name; utime: of the receipt, us since 1970. What
+  // was subscribed earlier is handed out first.
+  using AnyHandler =
+      std::function<void(int64_t utime, const std::string& channel, const uint8_t* data, size_t size)>;
+  void SubscribeAll(AnyHandler handler);
+
   static constexpr int kMaxBatch = 1000;
 
  private:
   _lcm_t* lcm_;
   std::vector<std::unique_ptr<BytesHandler>> handlers_;
+  std::vector<std::unique_ptr<AnyHandler>> any_handlers_;
   std::string channel_;  // prefix and name of what is being published, kept for its memory
 };
 

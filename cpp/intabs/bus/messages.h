@@ -63,7 +63,7 @@ struct PerceptionStatus {
   int64_t utime = 0;
   int64_t seq = 0;
   int n = 0;
-  std::array<int64_t, kMaxCameras> frames{}, dropped{}, late{};
+  std::array<int64_t, kMaxCameras> frames{}, dropped{}, late{}, doubled{}, torn{};
   std::array<float, kMaxCameras> fps{}, detect_us_p50{}, detect_us_p95{};
 };
 

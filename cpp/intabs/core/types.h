@@ -35,12 +35,17 @@ enum class ArmState : int8_t {
   kHolding = 3,   // stopped, holds the pose reached; a new session may take over
   kFault = 4,     // held too long without a command: needs RESET
   kStopped = 5,   // ESTOP: needs RESET
+  kAligning = 6,  // goes slowly to a session's first target, if that is far away; then kTracking
 };
 
 enum class Fault : int8_t {
   kNone = 0,
   kStaleCommand = 1,  // the running session went silent
   kEstop = 2,
+  kStaleStatus = 3,  // the arm's readings stopped coming
+  kLink = 4,         // the connection to the arm is lost
+  kVendor = 5,       // the arm reports an error: vendor_error
+  kOverrun = 6,      // the driver's loop stood still in mid-motion
 };
 
 enum class Refusal : int8_t {
@@ -125,7 +130,13 @@ struct TagDetections {
   std::array<TagDetection, kMaxTags> tags;
 };
 
-// What the plant knows. For scoring and viewers; feeds control only under `--perception truth`.
+// Whom an object touches: bits of PlantTruth::touches. Bit i < kMaxObjects: the object in slot i.
+inline constexpr uint8_t kTouchesLeftFinger = 1 << 4;
+inline constexpr uint8_t kTouchesRightFinger = 1 << 5;
+inline constexpr uint8_t kTouchesArm = 1 << 6;    // any other part of the arm or gripper
+inline constexpr uint8_t kTouchesScene = 1 << 7;  // table, cabinet, box, rack: what never moves; not beads
+
+// What the plant knows. For scoring, labels and viewers; feeds control only under `--perception truth`.
 struct PlantTruth {
   int64_t utime = 0;
   int64_t seq = 0;
@@ -134,6 +145,9 @@ struct PlantTruth {
   uint32_t subgoals = 0;  // bit i: sub-goal i of the task is reached
   bool success = false;
   uint64_t state_hash = 0;
+  std::array<uint8_t, kMaxObjects> touches{};   // by slot: kTouches...
+  std::array<int16_t, kMaxObjects> beads_in{};  // by slot: beads inside this vessel; 0 where it is none
+  int16_t beads = 0;                            // in the world
 };
 
 // Poses as control takes them under `--perception truth`.

@@ -34,8 +34,8 @@ def register(app: typer.Typer) -> None:
         json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
     ) -> None:
         """Record demonstrations: plant, perception and a scripted demonstrator over the same messages as on a bench."""
-        from intabs.demonstrate.collect import DEMONSTRATORS
         from intabs.demonstrate.collect import collect as run
+        from intabs.demonstrate.tasks import DEMONSTRATORS
 
         total = demos * (len(DEMONSTRATORS) if task == "all" else 1)
         with Progress("collect", total=total) as progress:

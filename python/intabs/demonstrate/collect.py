@@ -1,69 +1,44 @@
-"""Records demonstrations: the demonstrator sits where intabs_control sits, hears the same messages and answers with the
-same commands. What is written is what was heard on the bus.
+"""Records demonstrations as on a bench: the demonstrator moves the master arm, `intabs_record --mirror` makes the
+puppet follow and writes down everything that is said, and the log becomes a demonstration (log.py).
 """
 
 from __future__ import annotations
 
+import contextlib
 import random
+import shutil
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-import numpy as np
-
-from intabs import _core, bus, messages, paths
-from intabs.data.demos import OBJECT_SLOTS, Demo, save_demos
-from intabs.demonstrate.pick_place import PickPlace
+from intabs import bus, messages, paths
+from intabs.data.demos import Demo, save_demos
+from intabs.data.labels import KINDS
+from intabs.demonstrate.log import SERVO, TICK_US, demo_from_log, objects_of
+from intabs.demonstrate.tasks import DEMONSTRATORS, Job, Performance, require_task
 from intabs.errors import UserError
 from intabs.jobs import in_processes
 from intabs.processes import Processes, shared_memory_name
 
-DEMONSTRATORS = {"pick_place": PickPlace}
-POLICY_PERIOD_US = 40000
-SETTLE_TICKS = 15  # the plant goes on holding after the last movement, so that success can show
-MAX_TICKS = 1000
 SILENCE_S = 20.0
-SERVO, HOLD = 1, 0
+HOLD, TRACKING = 0, 1  # core/types.h ArmMode, ArmState
 
 
-@dataclass
-class Job:
-    task: str
-    seed: int
-    spread: float  # cm
-    perception: str
-    disturb: float  # scale of the disturbances the demonstrator has to correct
-    detours: float  # probability of each change of mind
+class _Master:
+    """The master arm on the bus: a simulated one lives on the puppet's time and numbers what it says by the puppet's
+    status it has seen."""
 
-
-def _array(poses) -> tuple[np.ndarray, np.ndarray]:
-    """OBJECT_POSES -> (S, 7) xyz wxyz, (S,) valid."""
-    pose = np.concatenate([np.array(poses.p_WO), np.array(poses.q_WO)], axis=1)
-    known = np.array(poses.id) >= 0
-    valid = np.array(poses.valid, bool) if hasattr(poses, "valid") else known
-    return pose, known & valid
-
-
-class _Recorder:
     def __init__(self, job: Job, link: bus.Bus):
-        rng = np.random.default_rng([job.seed, 7])
-        arm = _core.ArmModel.lite6()
-        self.demonstrator = DEMONSTRATORS[job.task](arm, _core.IkSolver(arm), rng, job.disturb, job.detours)
+        self.performance = Performance(job)
         self.link = link
-        self.session = random.SystemRandom().getrandbits(62) + 1
-        self.seq = 0
-        self.poses: dict[int, object] = {}
-        self.last_answer: tuple[int, object] | None = None
-        self.ticks: list[tuple] = []
-        self.settle: int | None = None
-        self.finished = False
+        self.source = random.SystemRandom().getrandbits(62) + 1
+        self.poses: dict[int, object] = {}  # by frame_seq
+        self.waiting = None  # puppet's status, for the poses of its frame
+        self.said = None  # the last status of ours
         self.success = False
-        self.spoke = time.monotonic()
-        self.waiting = None
-        self.kept: np.ndarray | None = None
-        self.gripper_closed = False
+        self.spoke, self.heard = time.monotonic(), False  # the puppet, by our clock
 
     def on_poses(self, m) -> None:
         self.poses = {m.frame_seq: m}
@@ -73,11 +48,11 @@ class _Recorder:
         self.success = bool(m.success)
 
     def on_status(self, s) -> None:
-        self.spoke = time.monotonic()
-        if s.utime % POLICY_PERIOD_US:
+        self.spoke, self.heard = time.monotonic(), True
+        if s.utime % TICK_US:
             return
-        if self.last_answer is not None and self.last_answer[0] == s.seq:
-            self.link.publish("LITE6_COMMAND", self.last_answer[1])
+        if self.said is not None and self.said.seq == s.seq:
+            self.link.publish("MASTER_LITE6_STATUS", self.said)
             return
         self.waiting = s
         self._try()
@@ -87,88 +62,68 @@ class _Recorder:
         if s is None or s.last_frame_seq not in self.poses:
             return
         self.waiting = None
-        pose, valid = _array(self.poses[s.last_frame_seq])
-        q = np.array(s.q)
-        command = messages.lite6_command_t()
-        command.mode = HOLD
-        command.q_target = list(s.q_commanded)
-        command.gripper_closed = self.gripper_closed
-        if self.settle is None:
-            intent = self.demonstrator.step(q, pose, valid)
-            if intent is not None:
-                command.mode = SERVO
-                command.q_target = intent.q_target.tolist()
-                command.gripper_closed = self.gripper_closed = intent.gripper_closed
-                self.ticks.append(
-                    (s.utime * 1e-6, q, np.array(s.dq), float(s.gripper_closed), pose, valid, intent.action)
-                )
-                if intent.done or len(self.ticks) >= MAX_TICKS:
-                    self.settle = 0
-        else:
-            self.settle += 1
-            self.finished = self.settle >= SETTLE_TICKS
-        self.seq += 1
-        command.utime, command.seq, command.session, command.status_seq = s.utime, self.seq, self.session, s.seq
-        command.dq_max = [2.14] * 6
-        command.lifetime_us = 200000
-        self.last_answer = (s.seq, command)
-        self.link.publish("LITE6_COMMAND", command)
+        tick = self.performance.tick(s.q, s.q_commanded, *objects_of(self.poses[s.last_frame_seq]))
+        m = messages.lite6_status_t()
+        m.utime, m.seq, m.source = s.utime, s.seq, self.source
+        m.last_frame_seq = s.last_frame_seq
+        m.mode = HOLD if tick.action is None else SERVO
+        m.state = TRACKING
+        m.q, m.q_commanded = tick.q.tolist(), tick.q_meant.tolist()
+        m.gripper_closed = tick.gripper_closed
+        self.said = m
+        self.link.publish("MASTER_LITE6_STATUS", m)
 
 
-def record(job: Job) -> Demo:
-    """One demonstration on a plant of its own. attrs["success"] says what the plant says."""
+def record(job: Job, keep_log: Path | None = None, scratch: Path | None = None) -> Demo:
+    """One demonstration on a plant of its own. attrs["success"] says what the plant says. keep_log: a file that shall
+    have the LCM log. scratch: a folder for what goes again."""
     url, ring = bus.private_url(), shared_memory_name()
     link = bus.Bus(url)
-    recorder = _Recorder(job, link)
-    link.subscribe("LITE6_STATUS", recorder.on_status)
-    link.subscribe("PLANT_TRUTH", recorder.on_truth)
-    if job.perception == "tags":
-        link.subscribe("OBJECT_POSES", recorder.on_poses)
-    else:
-        link.subscribe("PLANT_TRUTH", recorder.on_poses)
-    with tempfile.TemporaryDirectory() as logs, Processes(Path(logs)) as programs:
-        cameras = "--cameras" if job.perception == "tags" else "--no-cameras"
-        programs.start(
-            paths.program("intabs_plant"), "--task", job.task, "--seed", job.seed, "--spread", job.spread,
-            "--clock", "lockstep", "--lcm", url, "--ring", ring, cameras, "--models", paths.MODELS,
-        )  # fmt: skip
-        if job.perception == "tags":
+    master = _Master(job, link)
+    link.subscribe("LITE6_STATUS", master.on_status)
+    link.subscribe("PLANT_TRUTH", master.on_truth)
+    link.subscribe("OBJECT_POSES" if job.perception == "tags" else "PLANT_TRUTH", master.on_poses)
+    with tempfile.TemporaryDirectory(dir=scratch) as folder:
+        log = Path(folder) / "demonstration.lcmlog"
+        with Processes(Path(folder)) as programs:
             programs.start(
-                paths.program("intabs_perception"), "--lcm", url, "--ring", ring,
-                "--config", paths.MODELS / "config/perception.yaml",
+                paths.program("intabs_record"), "--mirror", "--clock", "lockstep", "--lcm", url, "--out", log
+            )
+            cameras = "--cameras" if job.perception == "tags" else "--no-cameras"
+            programs.start(
+                paths.program("intabs_plant"), "--task", job.task, "--seed", job.seed, "--spread", job.spread,
+                "--clock", "lockstep", "--lcm", url, "--ring", ring, cameras, "--models", paths.MODELS,
             )  # fmt: skip
-        while not recorder.finished:
-            link.handle(200)
-            programs.check()
-            if time.monotonic() - recorder.spoke > SILENCE_S:
-                raise UserError(f"the plant said nothing for {SILENCE_S:.0f} s")
-    return _demo(job, recorder)
+            seeing = job.perception != "tags"
+            while not master.performance.finished:
+                link.handle(200)
+                programs.check()
+                if not seeing and master.heard:  # only now there are frames to look at
+                    seeing = True
+                    programs.start(
+                        paths.program("intabs_perception"), "--lcm", url, "--ring", ring,
+                        "--config", paths.MODELS / "config/perception.yaml",
+                    )  # fmt: skip
+                if time.monotonic() - master.spoke > SILENCE_S:
+                    raise UserError(f"the plant said nothing for {SILENCE_S:.0f} s")
+        if keep_log is not None:
+            shutil.copy(log, keep_log)
+        return demo_from_log(log, _attrs(job, master))
 
 
-def _demo(job: Job, r: _Recorder) -> Demo:
-    time_s, q, dq, gripper, pose, valid, action = (np.array(x) for x in zip(*r.ticks, strict=True))
-    assert pose.shape[1] == OBJECT_SLOTS
-    return Demo(
-        time=time_s - time_s[0],
-        joint_pos=q,
-        joint_vel=dq,
-        gripper=gripper,
-        object_pose=pose,
-        object_valid=valid,
-        actions=action,
-        attrs={
-            "task": job.task,
-            "seed": job.seed,
-            "spread_cm": job.spread,
-            "perception": job.perception,
-            "disturb": job.disturb,
-            "detours": job.detours,
-            "success": r.success,
-            "rate_hz": 1e6 / POLICY_PERIOD_US,
-            "embodiment": "lite6",
-            "recorded": f"scripted demonstrator over LITE6_STATUS and OBJECT_POSES ({job.perception})",
-        },
-    )
+def _attrs(job: Job, master: _Master) -> dict:
+    failure = master.performance.failure
+    return {
+        "task": job.task,
+        "seed": job.seed,
+        "spread_cm": job.spread,
+        "perception": job.perception,
+        "disturb": job.disturb,
+        "detours": job.detours,
+        "success": master.success and not failure,
+        **({"failure": failure} if failure else {}),
+        "recorded": f"scripted demonstrator at the master, intabs_record --mirror, object poses by {job.perception}",
+    }
 
 
 def _check_target(out: Path) -> None:
@@ -184,6 +139,14 @@ def _check_target(out: Path) -> None:
         raise UserError(f"cannot write {out}: {e.strerror}; give another --out") from None
 
 
+def _jobs(task: str, demos: int, perception: str, seed: int, spread: float, disturb: float, detours: float):
+    """Twice as many as wanted, since some fail. Every fifth demonstration is straight: no disturbance, no change of
+    mind; plans are made from those."""
+    for i in range(2 * demos + 2):
+        varied = i % 5 > 0
+        yield Job(task, seed + i, spread, perception, disturb * varied, detours * varied)
+
+
 def collect(
     task: str,
     demos: int,
@@ -196,33 +159,48 @@ def collect(
     jobs: int = 1,
     progress: Callable[[int, str], None] = lambda done, text: None,
 ) -> dict:
-    """Records until `demos` of every task succeeded. Failed tries are counted and left out. Every fifth
-    demonstration is straight: no disturbance, no change of mind; plans are made from those."""
+    """Records until `demos` of every task succeeded; "all" are the five tasks. Failed tries are counted and left out.
+    Whatever ends it early, the demonstrations recorded so far are kept."""
     tasks = list(DEMONSTRATORS) if task == "all" else [task]
-    unknown = [t for t in tasks if t not in DEMONSTRATORS]
-    if unknown:
-        raise UserError(f"unknown task '{unknown[0]}': known are {', '.join(DEMONSTRATORS)}")
+    for name in tasks:
+        require_task(name)
     bus.require_route()
+    out = Path(out)
+    _check_target(out)
     kept: list[Demo] = []
     figures: dict = {}
-    _check_target(Path(out))
-    for name in tasks:
-        good: list[Demo] = []
-        tried = 0
-        queue = (
-            Job(name, seed + i, spread, perception, disturb * (i % 5 > 0), detours * (i % 5 > 0))
-            for i in range(2 * demos + 2)
-        )
-        for demo in in_processes(record, queue, jobs):
-            tried += 1
-            if demo.attrs["success"]:
-                good.append(demo)
-            progress(len(kept) + len(good), f"{name}: {len(good)} of {tried} succeeded")
-            if len(good) == demos:
-                break
-        if len(good) < demos:
-            raise UserError(f"{name}: only {len(good)} of {tried} demonstrations succeeded")
-        kept += good
-        figures[name] = {"demos": len(good), "success": len(good), "tried": tried}
-    save_demos(out, kept, {"task": task, "rate_hz": 1e6 / POLICY_PERIOD_US, "embodiment": "lite6"})
+    # A worker that is ended leaves its folder behind; it goes with this one.
+    scratch = tempfile.TemporaryDirectory(prefix="intabs_collect_", ignore_cleanup_errors=True)
+    try:
+        for name in tasks:
+            count = figures[name] = {"demos": 0, "success": 0, "tried": 0}
+            queue = _jobs(name, demos, perception, seed, spread, disturb, detours)
+            with contextlib.closing(in_processes(partial(record, scratch=Path(scratch.name)), queue, jobs)) as recorded:
+                for demo in recorded:
+                    count["tried"] += 1
+                    if demo.attrs["success"]:
+                        count["success"] += 1
+                        count["demos"] += 1
+                        kept.append(demo)
+                    progress(len(kept), f"{name}: {count['success']} of {count['tried']} succeeded")
+                    if count["demos"] == demos:
+                        break
+            if count["demos"] < demos:
+                raise UserError(f"{name}: only {count['demos']} of {count['tried']} demonstrations succeeded")
+    except BaseException as e:
+        if kept:
+            _save(out, task, kept)
+        if isinstance(e, (KeyboardInterrupt, UserError)):
+            why = "interrupted" if isinstance(e, KeyboardInterrupt) else str(e)
+            rest = f"{out} keeps the {len(kept)} demonstrations recorded so far" if kept else "nothing was recorded"
+            raise UserError(f"{why}; {rest}") from None
+        raise
+    finally:
+        scratch.cleanup()
+    _save(out, task, kept)
     return {"demos": len(kept), "frames": sum(len(d) for d in kept), "tasks": figures}
+
+
+def _save(out: Path, task: str, demos: list[Demo]) -> None:
+    attrs = {"task": task, "rate_hz": 1e6 / TICK_US, "embodiment": "lite6", "label_names": list(KINDS)}
+    save_demos(out, demos, attrs)

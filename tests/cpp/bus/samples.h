@@ -128,11 +128,15 @@ inline PlantTruth Largest() {
   m.subgoals = 0xffffffff;
   m.success = true;
   m.state_hash = 0xfedcba9876543210;
+  m.touches = {0x81, 0x42, 0x24, 0x18};
+  m.beads_in = {1, -2, 3, 0x7fff};
+  m.beads = 30;
   return m;
 }
 inline bool Same(const PlantTruth& a, const PlantTruth& b) {
   bool same = a.utime == b.utime && a.seq == b.seq && a.frame_seq == b.frame_seq &&
-              a.subgoals == b.subgoals && a.success == b.success && a.state_hash == b.state_hash;
+              a.subgoals == b.subgoals && a.success == b.success && a.state_hash == b.state_hash &&
+              a.touches == b.touches && a.beads_in == b.beads_in && a.beads == b.beads;
   for (int i = 0; i < kMaxObjects; ++i) {
     same = same && a.objects[i].id == b.objects[i].id && Same(a.objects[i].X_WO, b.objects[i].X_WO) &&
            b.objects[i].valid;
@@ -244,6 +248,8 @@ inline PerceptionStatus Largest() {
     m.frames[i] = c.Int();
     m.dropped[i] = c.Int();
     m.late[i] = c.Int();
+    m.doubled[i] = c.Int();
+    m.torn[i] = c.Int();
     m.fps[i] = static_cast<float>(c());
     m.detect_us_p50[i] = static_cast<float>(c());
     m.detect_us_p95[i] = static_cast<float>(c());
@@ -252,8 +258,8 @@ inline PerceptionStatus Largest() {
 }
 inline bool Same(const PerceptionStatus& a, const PerceptionStatus& b) {
   return a.utime == b.utime && a.seq == b.seq && a.n == b.n && a.frames == b.frames &&
-         a.dropped == b.dropped && a.late == b.late && a.fps == b.fps && a.detect_us_p50 == b.detect_us_p50 &&
-         a.detect_us_p95 == b.detect_us_p95;
+         a.dropped == b.dropped && a.late == b.late && a.doubled == b.doubled && a.torn == b.torn &&
+         a.fps == b.fps && a.detect_us_p50 == b.detect_us_p50 && a.detect_us_p95 == b.detect_us_p95;
 }
 
 template <>
