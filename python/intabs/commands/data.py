@@ -1,150 +1,277 @@
-"""`intabs data`: what a file of demonstrations holds, and what is wrong with it."""
+"""`intabs data`: what files of demonstrations hold, what is wrong with them, others' made ours, many made one."""
 
 from __future__ import annotations
 
-from collections import Counter
+import os
+import sys
+import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from intabs.errors import UserError
-from intabs.output import write_json
+from intabs.output import Progress, write_json
 
 JsonOption = Annotated[Path | None, typer.Option("--json", help="Write the figures there.")]
 FileArgument = Annotated[Path, typer.Argument(help="Demonstrations, HDF5.", show_default=False)]
+OutOption = Annotated[Path | None, typer.Option("--out", "-o", help="File to write; without it the file itself.")]
+SHOWN = 20  # faults of a kind on the terminal
+
+
+def find_faults(file: Path) -> list[dict]:
+    """[{demo, kind, where}], in the order of the file."""
+    from intabs.data import check
+
+    with Progress("check", total=1) as bar:
+        return check.find_faults(file, _counting(bar))
+
+
+def inspect(file: Path) -> dict:
+    from intabs.data import reader
+
+    return reader.inspect(file)
 
 
 def register(app: typer.Typer) -> None:
-    data = typer.Typer(help="Look into files of demonstrations.")
+    data = typer.Typer(help="Look into, check, import and edit files of demonstrations.")
     app.add_typer(data, name="data")
+
+    @data.callback()
+    def _output() -> None:
+        # Names in a damaged file may be no text.
+        for stream in (sys.stdout, sys.stderr):
+            if hasattr(stream, "reconfigure"):
+                stream.reconfigure(errors="backslashreplace")
 
     @data.command()
     def info(file: FileArgument, json: JsonOption = None) -> None:
         """What a file holds."""
         figures = inspect(file)
         write_json(json, figures)
-        for key in ("demos", "frames", "rate_hz", "embodiment"):
-            print(f"{key:<12}{figures[key]}")
-        for task, n in figures["tasks"].items():
-            print(f"{'task':<12}{task}: {n}")
-        for name, shape in figures["state"].items():
-            print(f"{'state':<12}{name} {shape}")
+        _tell(figures)
 
     @data.command()
     def check(file: FileArgument, json: JsonOption = None) -> None:
-        """Look for faults: fields that are missing or of the wrong length, numbers that are not finite, time that does
-        not advance, quaternions that are none. Exit 0 only if there are none."""
+        """Look for faults: fields that are missing or of the wrong shape or length, numbers that are not finite, time
+        that goes back, frames twice, jumps, quaternions that are none or in the wrong order, a rate that is not what
+        it says, a gripper that never moves, objects never seen, units. Exit 0 only if there are none."""
         faults = find_faults(file)
         write_json(json, {"faults": faults})
+        shown: dict[str, int] = {}
         for fault in faults:
-            print(f"{fault['demo']}: {fault['kind']} ({fault['where']})")
+            shown[fault["kind"]] = shown.get(fault["kind"], 0) + 1
+            if shown[fault["kind"]] <= SHOWN:
+                print(f"{fault['demo']}: {fault['kind']} ({fault['where']})")
+        for kind, n in shown.items():
+            if n > SHOWN:
+                print(f"... and {n - SHOWN} more of kind {kind} (all of them: --json FILE)")
         if faults:
             raise UserError(f"{file} has {len(faults)} fault{'s' if len(faults) > 1 else ''}")
         print(f"{file}: no faults")
 
+    @data.command()
+    def view(
+        file: FileArgument,
+        out: Annotated[
+            Path | None, typer.Option("--out", "-o", help="Page (.html) or picture strip (.png); default FILE.html.")
+        ] = None,
+        demo: Annotated[list[int] | None, typer.Option(help="Number of a demonstration; may be repeated.")] = None,
+        most: Annotated[int, typer.Option(min=1, help="At most so many demonstrations.")] = 10,
+        rerun: Annotated[bool, typer.Option("--rerun", help="Open in rerun instead (-o FILE.rrd: for later).")] = False,
+        viser: Annotated[bool, typer.Option("--viser", help="Serve one demonstration to a browser instead.")] = False,
+    ) -> None:
+        """Demonstrations to look at: trajectories, labels, pictures where there are any."""
+        from intabs.data import view as views
 
-def _open(file: Path):
-    import h5py
+        chosen = _chosen(file, demo, most)
+        if viser:
+            views.to_viser(file, chosen[0], _until_interrupted)
+            return
+        if rerun:
+            views.to_rerun(file, chosen, out)
+            return
+        target = out or file.with_suffix(".html")
+        if target.suffix == ".png":
+            image = views.strip(file, chosen[0])
+            _written(target, lambda p: image.save(p, "PNG"))
+        elif target.suffix in (".html", ".htm"):
+            text = views.page(file, chosen)
+            _written(target, lambda p: p.write_text(text, encoding="utf-8", errors="replace"))
+        else:
+            raise UserError(f"{target}: a page ends in .html, a strip in .png")
+        print(f"{target}: {len(chosen) if target.suffix != '.png' else 1} demonstrations")
 
-    if not file.is_file():
-        raise UserError(f"{file}: no such file")
+    @data.command(name="import")
+    def import_(
+        kind: Annotated[str, typer.Argument(help="robosuite, robomimic, roboturk, kitchen, lerobot, lite6-csv, npz.")],
+        source: Annotated[Path, typer.Argument(help="File or folder.", show_default=False)],
+        out: Annotated[Path, typer.Argument(help="File to write.", show_default=False)],
+        agent: Annotated[str | None, typer.Option(help="npz: name of the agent's array.")] = None,
+        object: Annotated[str | None, typer.Option(help="npz: name of the objects' array.")] = None,
+        time_key: Annotated[str, typer.Option("--time", help="npz: name of the array of times.")] = "time",
+        rate: Annotated[float | None, typer.Option(min=0.1, max=10000, help="Resample to this rate [Hz].")] = None,
+        source_rate: Annotated[
+            float | None, typer.Option(min=0.1, max=10000, help="Rate of the files, where they do not say it [Hz].")
+        ] = None,
+        units: Annotated[str, typer.Option(help="Of the joints, where files do not say it: rad, deg, none.")] = "rad",
+        quat: Annotated[str, typer.Option(help="npz: order of quaternions, wxyz or xyzw.")] = "wxyz",
+        json: JsonOption = None,
+    ) -> None:
+        """Other people's demonstrations in our format. Says units, frames, quaternions and rate, and checks them."""
+        from intabs.data import importers
+
+        for name, value, known in (("--units", units, ("rad", "deg", "none")), ("--quat", quat, ("wxyz", "xyzw"))):
+            if value not in known:
+                raise UserError(f"{name} {value}: known are {', '.join(known)}")
+        options = importers.Options(
+            rate_hz=rate, source_rate_hz=source_rate, units=units, quaternion=quat,
+            agent=agent, object=object, time=time_key,
+        )  # fmt: skip
+        with Progress("import", total=1) as bar:
+            figures = importers.import_demos(kind, source, out, options, _counting(bar))
+        write_json(json, figures)
+        _tell(figures)
+
+    @data.command()
+    def merge(
+        files: Annotated[list[Path], typer.Argument(help="Two files or more.", show_default=False)],
+        out: Annotated[Path, typer.Option("--out", "-o", help="File to write.", show_default=False)],
+        json: JsonOption = None,
+    ) -> None:
+        """Several files in one. Demonstrations are numbered anew; those held out stay held out."""
+        from intabs.data import edit as edits
+
+        with Progress("merge", total=1) as bar:
+            edits.merge(files, out, _counting(bar))
+        figures = inspect(out)
+        write_json(json, figures)
+        print(f"{out}: {figures['demos']} demonstrations, {figures['frames']} frames")
+
+    @data.command()
+    def split(
+        file: FileArgument,
+        out: OutOption = None,
+        valid: Annotated[float, typer.Option(min=0, max=1, help="Share to hold out, of every task.")] = 0.1,
+        seed: Annotated[int, typer.Option(min=0)] = 0,
+        apart: Annotated[bool, typer.Option("--apart", help="Two files, OUT_train and OUT_valid, instead.")] = False,
+        json: JsonOption = None,
+    ) -> None:
+        """Hold out demonstrations anew (masks train and valid)."""
+        from intabs.data import edit as edits
+
+        with Progress("split", total=1) as bar:
+            figures = edits.split(file, out or file, valid, seed, apart, _counting(bar))
+        write_json(json, figures)
+        print(", ".join(f"{mask}: {n}" for mask, n in figures.items()))
+
+    @data.command()
+    def edit(
+        file: FileArgument,
+        out: OutOption = None,
+        drop: Annotated[
+            list[str] | None, typer.Option(help="Demonstrations to leave out: numbers or names, 3,7-9 or demo_3.")
+        ] = None,
+        cut: Annotated[
+            list[str] | None, typer.Option(help="Frames to keep of one: 4:10:200, 4::200 or 4:10: (may be repeated).")
+        ] = None,
+        json: JsonOption = None,
+    ) -> None:
+        """Drop or cut demonstrations. The rest keep their names."""
+        from intabs.data import edit as edits
+        from intabs.data.reader import DemoFile
+
+        if not drop and not cut:
+            raise UserError("nothing to do: give --drop or --cut")
+        with DemoFile(file) as f:
+            cuts = dict(_cut(text, f) for text in cut or [])
+        with Progress("edit", total=1) as bar:
+            figures = edits.edit(file, out or file, _names(drop or []), cuts, _counting(bar))
+        write_json(json, figures)
+        print(f"{out or file}: {figures['demos']} left, {figures['dropped']} dropped, {figures['cut']} cut")
+
+
+def _tell(figures: dict) -> None:
+    for key in ("demos", "frames", "rate_hz", "embodiment", "layout"):
+        print(f"{key:<12}{figures[key]}")
+    agent = figures["agent"]
+    print(f"{'agent':<12}{' + '.join(agent['fields'])}: {agent['width']} numbers")
+    print(f"{'objects':<12}{figures['object_slots']}")
+    tasks = sorted(figures["tasks"].items(), key=lambda x: -x[1])
+    for task, n in tasks[:SHOWN]:
+        print(f"{'task':<12}{task}: {n}")
+    if len(tasks) > SHOWN:
+        print(f"{'':<12}... and {len(tasks) - SHOWN} more tasks")
+    for name, shape in figures["state"].items():
+        print(f"{'state':<12}{name} {shape}")
+
+
+def _counting(bar: Progress):
+    """Moves the bar; says nothing about what is done in two seconds."""
+    start = time.monotonic()
+
+    def update(done: int, total: int) -> None:
+        if time.monotonic() - start > 2:
+            bar.update(done / max(total, 1), f"{done} of {total}")
+
+    return update
+
+
+def _chosen(file: Path, demo: list[int] | None, most: int) -> list[int]:
+    """Indices into the file of the demonstrations of these numbers, or of some over the whole file."""
+    from intabs.data.reader import DemoFile
+
+    with DemoFile(file) as f:
+        number = {n: k for k, n in enumerate(f.names)}
+        for n in demo or []:
+            if f"demo_{n}" not in number:
+                raise UserError(f"{file}: has no demo_{n}; it holds {f.names[0]} to {f.names[-1]}")
+        if demo:
+            return [number[f"demo_{n}"] for n in demo]
+        step = max(1, -(-len(f) // most))
+        return list(range(0, len(f), step))
+
+
+def _names(texts: list[str]) -> list[str]:
+    """3,7-9 and demo_3 -> names."""
+    out = []
+    for part in (p.strip() for text in texts for p in text.split(",")):
+        first, _, last = part.removeprefix("demo_").partition("-")
+        last = last.removeprefix("demo_") or first
+        if not (first.isascii() and first.isdecimal() and last.isascii() and last.isdecimal()):
+            raise UserError(f"--drop {part}: not a number, a range or a name (3,7-9, demo_3)")
+        if int(last) - int(first) > 10_000_000:
+            raise UserError(f"--drop {part}: too many")
+        out += [f"demo_{n}" for n in range(int(first), int(last) + 1)]
+    return out
+
+
+def _cut(text: str, f) -> tuple[str, tuple[int, int]]:
+    parts = text.split(":")
+    if len(parts) != 3 or not all(p == "" or (p.isascii() and p.isdecimal()) for p in parts[1:]):
+        raise UserError(f"--cut {text}: not DEMO:FROM:TO (4:10:200 keeps frames 10 to 199 of demo_4)")
+    name = _names([parts[0]])[0]
+    if name not in f.names:
+        raise UserError(f"--cut {text}: the file has no {name}")
+    stop = int(f.lengths[f.names.index(name)])
+    return name, (int(parts[1] or 0), int(parts[2] or stop))
+
+
+def _written(path: Path, write) -> None:
+    """Beside the target, then renamed."""
+    partial = path.with_name(path.name + ".partial")
+    path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        f = h5py.File(file, "r")
-    except OSError as e:
-        raise UserError(f"{file}: not an HDF5 file, or cut off ({e})") from None
-    if not _demos(f):
-        f.close()
-        raise UserError(f"{file}: holds no demonstration (no group data/demo_*)")
-    return f
+        write(partial)
+        os.replace(partial, path)
+    finally:
+        partial.unlink(missing_ok=True)
 
 
-def _demos(f) -> dict:
-    """Name -> group, in the order of their numbers."""
-    import h5py
-
-    data = f.get("data")
-    if not isinstance(data, h5py.Group):
-        return {}
-    names = [n for n in data if n.startswith("demo_") and n[5:].isdigit() and isinstance(data[n], h5py.Group)]
-    return {n: data[n] for n in sorted(names, key=lambda n: int(n[5:]))}
-
-
-def inspect(file: Path) -> dict:
-    with _open(file) as f:
-        demos = _demos(f)
-        attrs = f["data"].attrs
-        first = next(iter(demos.values()))
-        tasks = Counter(str(g.attrs.get("task", attrs.get("task", "unknown"))) for g in demos.values())
-        rate = attrs.get("rate_hz", attrs.get("rate"))
-        return {
-            "demos": len(demos),
-            "frames": sum(_length(g) for g in demos.values()),
-            "rate_hz": None if rate is None else float(rate),
-            "embodiment": str(attrs.get("embodiment", "unknown")),
-            "state": {n: list(d.shape[1:]) for n, d in first.get("obs", {}).items() if hasattr(d, "shape")},
-            "tasks": dict(tasks),
-        }
-
-
-def _length(demo) -> int:
-    if "actions" in demo:
-        return len(demo["actions"])
-    return max((len(d) for d in demo.get("obs", {}).values() if getattr(d, "shape", ())), default=0)
-
-
-def find_faults(file: Path) -> list[dict]:
-    """[{demo, kind, where}], in the order of the file."""
-    import numpy as np
-
-    faults = []
-    with _open(file) as f:
-        demos = _demos(f)
-        for name, group in demos.items():
-
-            def fault(kind: str, where: str, name: str = name) -> None:
-                faults.append({"demo": name, "kind": kind, "where": where})
-
-            for part in ("obs", "actions"):
-                if part not in group:
-                    fault("missing", part)
-            length = _length(group)
-            if length < 2:
-                fault("too short", f"{length} frames")
-            fields = {f"obs/{n}": d for n, d in group.get("obs", {}).items() if hasattr(d, "shape")}
-            if "actions" in group:
-                fields["actions"] = group["actions"]
-            arrays = {}
-            for where, dataset in fields.items():
-                try:
-                    arrays[where] = dataset[...]
-                except OSError as e:
-                    fault("unreadable", f"{where}: {e}")
-            for where, array in arrays.items():
-                if array.ndim == 0 or len(array) != length:
-                    fault("length", f"{where} has {len(array) if array.ndim else 'one value'}, actions {length}")
-                if array.dtype.kind == "f" and not np.isfinite(array).all():
-                    row = int(np.argwhere(~np.isfinite(array))[0][0]) if array.ndim else 0
-                    fault("not finite", f"{where}, frame {row}")
-            clock = arrays.get("obs/time")
-            if clock is not None and clock.ndim == 1 and (step := np.diff(clock)).size and not (step > 0).all():
-                fault("time", f"does not advance after frame {int(np.argmax(~(step > 0)))}")
-            for where, pose in arrays.items():
-                if not (where.startswith("obs/object_") and where.endswith("_pose")):
-                    continue
-                if pose.ndim != 2 or pose.shape[1] != 7:
-                    fault("shape", f"{where} is {pose.shape}, not (T, 7)")
-                    continue
-                valid = arrays.get(where.removesuffix("_pose") + "_valid")
-                used = np.ones(len(pose), bool)
-                if valid is not None and len(valid) == len(pose):
-                    used = valid.reshape(len(valid), -1)[:, 0] > 0
-                off = used & (np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1) > 1e-3)
-                if off.any():
-                    fault("quaternion", f"{where}, frame {int(np.argmax(off))}: norm is not 1")
-        for mask in ("train", "valid"):
-            for name in f[f"mask/{mask}"][...].tolist() if f"mask/{mask}" in f else []:
-                name = name.decode() if isinstance(name, bytes) else str(name)
-                if name not in demos:
-                    faults.append({"demo": name, "kind": "missing", "where": f"named by mask/{mask}"})
-    return faults
+def _until_interrupted() -> None:
+    print("Ctrl-C ends it")
+    try:
+        while True:
+            time.sleep(1)
+    except KeyboardInterrupt:
+        return
