@@ -14,7 +14,7 @@ from pathlib import Path
 
 from intabs import bus, messages, paths
 from intabs.errors import UserError
-from intabs.processes import Processes, shared_memory_name, terminated_like_interrupted
+from intabs.processes import Processes, free_ports, shared_memory_name, terminated_like_interrupted
 
 WEIGHTS = "lite6"
 SUBGOALS = {"pick_place": ("grasped", "lifted", "placed")}
@@ -37,6 +37,7 @@ class Options:
     task: str = "pick_place"
     perception: str = "tags"
     clock: str = "lockstep"
+    arm: str = "plant"  # or "lite6": the driver, and a fake controller with the plant behind it; clock "wall" alone
     seed: int = 0
     spread: float = 2.0  # cm
     out: Path = Path("out/demo")
@@ -158,7 +159,8 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
     broke. `report(share, text)` is called while it runs."""
     weights = paths.MODELS / "weights" / WEIGHTS
     skills = load_plan(options.task, weights)
-    programs = {name: paths.program(f"intabs_{name}") for name in ("plant", "perception", "control")}
+    worlds = ("fake_lite6", "lite6") if options.arm == "lite6" else ("plant",)
+    programs = {name: paths.program(f"intabs_{name}") for name in (*worlds, "perception", "control")}
     bus.require_route()
     out = Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
@@ -186,14 +188,26 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
                 listener.handle(100)
 
         report(0.0, "starting")
+        ports = free_ports(5)
         processes.start(
-            programs["plant"],
+            programs[worlds[0]],
             *("--lcm", url, "--models", paths.MODELS, "--task", options.task, "--seed", options.seed),
-            *("--spread", options.spread, "--clock", options.clock, "--ring", ring, "--cameras"),
-            *("--video", out / "video.mp4", "--strip", out / "strip.png", "--json", figures["plant"]),
+            *("--spread", options.spread, "--ring", ring, "--cameras"),
+            *("--video", out / "video.mp4", "--strip", out / "strip.png", "--json", figures[worlds[0]]),
             *(["--viewer"] if options.viewer else []),
+            *(
+                ("--plant", "--port", ports, "--report-port-base", ports + 1)
+                if options.arm == "lite6"
+                else ("--clock", options.clock)
+            ),
         )
-        wait_for(lambda: run.truth, 30, "intabs_plant said nothing")
+        wait_for(lambda: run.truth, 30, f"intabs_{worlds[0]} said nothing")
+        if options.arm == "lite6":
+            processes.start(
+                programs["lite6"],
+                *("--lcm", url, "--host", "127.0.0.1", "--port", ports, "--report-port", ports + 1),
+                *("--flight", out / "logs", "--json", figures["lite6"]),
+            )
         if options.perception == "tags":
             processes.start(
                 programs["perception"],
@@ -218,7 +232,7 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
         while (end := run.end(limit_s)) is None:
             processes.check()
             if not listener.handle(100) and time.monotonic() - run.spoke > 15:
-                raise UserError(f"intabs_plant fell silent; what it said is in {out / 'logs'}")
+                raise UserError(f"intabs_{worlds[0]} fell silent; what it said is in {out / 'logs'}")
             report(*_standing(run))
         codes = processes.stop(patience_s=60)
     for name, code in codes.items():

@@ -8,7 +8,9 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import random
 import signal
+import socket
 import subprocess
 import time
 from collections.abc import Iterator
@@ -106,6 +108,20 @@ def terminated_like_interrupted() -> Iterator[None]:
     finally:
         for s, handler in before.items():
             signal.signal(s, handler)
+
+
+def free_ports(n: int) -> int:
+    """The first of n TCP ports in a row that nobody listens on."""
+    while True:
+        base = random.SystemRandom().randrange(20000, 32000 - n)  # below the ephemeral ports
+        with contextlib.ExitStack() as stack:
+            try:
+                for port in range(base, base + n):
+                    probe = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_STREAM))
+                    probe.bind(("127.0.0.1", port))
+                return base
+            except OSError:
+                continue
 
 
 def shared_memory_name() -> str:

@@ -93,6 +93,26 @@ def test_missing_models_of_the_plant(tmp_path):
     one_line("intabs_plant", "--lcm", bus.private_url(), "--models", tmp_path, "--task", TASK)
 
 
+@pytest.mark.parametrize("program", ["intabs_plant", "intabs_control", "intabs_perception"])
+def test_a_faulty_configuration_names_file_and_key(program, tmp_path):
+    file = tmp_path / "c.yaml"
+    for text, part in (("nonsense: 1\n", 'key "nonsense"'), ("lcm: {a: 1}\n", 'key "lcm"'), ("lcm: [\n", "line 2")):
+        file.write_text(text)
+        line = one_line(program, "--config", file)
+        assert str(file) in line
+        assert part in line
+
+
+@pytest.mark.parametrize("program", ["intabs_plant", "intabs_control"])
+def test_a_faulty_value_of_a_configuration_names_file_and_key(program, tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text("clock: sundial\n")
+    line = one_line(program, "--config", file)
+    assert str(file) in line
+    assert 'key "clock"' in line
+    assert str(file) not in one_line(program, "--config", file, "--clock", "moon")
+
+
 def test_no_camera():
     ring = shared_memory_name()
     config = paths.MODELS / "config" / "perception.yaml"

@@ -16,6 +16,10 @@ constexpr Suite kSuites[] = {
     {"lstm", &intabs::bench::Lstm,
      "one policy tick in each weight format and instruction set, a batch, the memory limit"},
     {"encoder", &intabs::bench::Encoder, "a bidirectional network over 100 steps, one thread and two"},
+    {"tags", &intabs::bench::Tags, "1280 x 720 with five tags on the move, beside AprilTag on whole frames"},
+    {"filter", &intabs::bench::Filter, "a tick of the command filter, collision look-ahead included"},
+    {"loop", &intabs::bench::Loop, "how late a 250 Hz loop wakes up, beside cyclictest if that is installed"},
+    {"plant", &intabs::bench::Plant, "a driver tick of each task's world, the arm swinging, without pictures"},
 };
 
 }  // namespace
@@ -36,6 +40,7 @@ int main(int argc, char** argv) {
       ->check(CLI::Range(1, 100));
   app.add_option("--samples", options.samples, "Samples of a quick row in a round")
       ->check(CLI::Range(20, 1000000));
+  app.add_option("--models", options.models, "plant: folder with scenes, objects and the arm")->capture_default_str();
   app.add_option("--soak", options.soak, "lstm: also a run of so many steps for the tail, pinned")
       ->check(CLI::Range(0L, 100000000L));
   try {

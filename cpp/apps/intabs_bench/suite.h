@@ -14,6 +14,7 @@ namespace intabs::bench {
 struct Options {
   int rounds = 5;     // each round measures every row, so that a ratio compares neighbours in time
   int samples = 500;  // of a quick row in one round; slow rows take fewer
+  std::string models = "models";  // folder; plant
   long soak = 0;      // steps of the long run for the tail; 0: none
 };
 
@@ -56,6 +57,10 @@ void Measure(Samples& row, int samples, F&& f) {
 // The suites.
 Report Lstm(const Options& options);
 Report Encoder(const Options& options);
+Report Tags(const Options& options);
+Report Filter(const Options& options);
+Report Loop(const Options& options);
+Report Plant(const Options& options);
 
 std::string MachineName();  // the CPU's model and what is supported
 void Print(const Report& report);

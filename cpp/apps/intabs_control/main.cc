@@ -8,6 +8,7 @@
 #include <optional>
 #include <random>
 
+#include "../common/hand_eye.h"
 #include "../common/yaml_config.h"
 #include "intabs/bus/lcm_bus.h"
 #include "intabs/rt/periodic.h"
@@ -27,6 +28,7 @@ struct Options {
   std::string weights = "models/weights/lite6";
   std::string perception = "tags";
   std::string clock = "lockstep";
+  std::string hand_eye;
   std::string json;
 };
 
@@ -77,6 +79,7 @@ class Control {
       : options_(options),
         bus_(options.lcm, options.prefix),
         controller_(Policy::Load(options.weights, ArmModel::Lite6()), RandomSession()) {
+    if (!options.hand_eye.empty()) X_BW_ = LoadHandEye(options.hand_eye).Inverse();
     bus_.Subscribe(kLite6Status, std::function<void(const ArmStatus&)>([this](const ArmStatus& s) { OnStatus(s); }));
     bus_.Subscribe(kSkillPlan, std::function<void(const SkillPlan&)>([this](const SkillPlan& p) { OnPlan(p); }));
     // PLANT_TRUTH is listened to under --perception truth alone.
@@ -130,8 +133,15 @@ class Control {
     status_.Offer(s);
   }
 
+  // The policy knows the arm's base alone. In the plant that is W.
   void OnPoses(const ObjectPoses& p) {
-    if (!poses_ || p.exposure_utime >= poses_->exposure_utime) poses_ = p;
+    // Late ones. After a reset of the plant time starts again, the frames go on counting.
+    if (poses_ && p.exposure_utime < poses_->exposure_utime && p.frame_seq < poses_->frame_seq) return;
+    poses_ = p;
+    if (!X_BW_) return;
+    for (TrackedObject& o : poses_->objects) {
+      if (o.id >= 0) o.X_WO = *X_BW_ * o.X_WO;
+    }
   }
 
   void OnPlan(const SkillPlan& part) {
@@ -281,7 +291,8 @@ class Control {
   SkillController controller_;
   PlanReceiver plan_;
   Newest<ArmStatus> status_;
-  std::optional<ObjectPoses> poses_;
+  std::optional<ObjectPoses> poses_;  // in the arm's base
+  std::optional<Pose> X_BW_;          // unset: W is the base
   ArmCommand command_;
   bool started_ = false;
   bool said_ = false;
@@ -306,14 +317,11 @@ int Main(int argc, char** argv) {
   app.add_option("--clock", o.clock, "lockstep or wall, as the plant; a real arm: wall")
       ->check(CLI::IsMember({"lockstep", "wall"}))
       ->capture_default_str();
+  app.add_option("--hand-eye", o.hand_eye,
+                 "YAML with X_WB, the arm base in W: what tools/calibrate hand-eye wrote, or the configuration of "
+                 "intabs_perception; none: W is the base, as in the plant");
   app.add_option("--json", o.json, "write the figures there at the end");
-  try {
-    app.parse(argc, argv);
-  } catch (const CLI::ParseError& e) {
-    if (e.get_exit_code() == 0) return app.exit(e);
-    std::cerr << "intabs_control: " << e.what() << " (see --help)\n";
-    return 1;
-  }
+  if (const auto code = ParseCommandLine(app, "intabs_control", argc, argv)) return *code;
   InstallStopSignals();
   try {
     Control control(o);

@@ -1,18 +1,28 @@
 // What stands between a policy's commands and the arm: sessions, command filter, watchdog and safety states.
 // The same object runs in the plant, in the driver of the real arm and in in-process rollouts.
 //
-//   Idle --command--> Tracking --stale or kHold--> Slowing --at rest--> Holding --stale for 2 s--> Fault
-//                        ^----- command of the session ---|----------------|
-//   ESTOP leads from any state to Stopped; RESET from Fault and Stopped to Holding (by way of Slowing).
+//   Idle --command--> Aligning --near--> Tracking --stale, kHold, link--> Slowing --at rest--> Holding
+//                        ^------------------------- command of the session -|---------------------|
+//   Holding with nothing commanded, or no link, for 2 s: Fault. Fail() leads to Fault from any state but
+//   Stopped, ESTOP from any state to Stopped; RESET from both to Holding (by way of Slowing).
+//   What leads where, and which test shows it: README.md.
 #pragma once
 
 #include <array>
 #include <cstdint>
 
-#include "intabs/control/joint_filter.h"
+#include "intabs/control/command_filter.h"
+#include "intabs/control/tick_record.h"
 #include "intabs/core/types.h"
 
 namespace intabs {
+
+struct ArmSafety {
+  double align_within = 0.1;  // a first target farther than this [rad, any joint] is approached slowly ...
+  double align_dq = 0.35;     // ... at this speed [rad/s], until it is as near
+  // Two ticks farther apart than this, in motion: Fault::kOverrun. 0: not watched (a simulated arm waits).
+  int64_t stall_us = 0;
+};
 
 // Real-time safe: fixed memory, no call throws or blocks. One thread. Times are of one clock that never goes
 // back.
@@ -21,7 +31,7 @@ class ArmController {
   static constexpr int64_t kFaultAfterUs = 2000000;    // held without a command since it went stale
   static constexpr int64_t kMaxLifetimeUs = 10000000;  // a longer one would switch the watchdog off
 
-  ArmController(const ArmLimits& limits, const ArmModel& model) noexcept;
+  ArmController(const ArmLimits& limits, const ArmModel& model, const ArmSafety& safety = {}) noexcept;
 
   // Holds this pose; idle, no session, nothing counted. `q_measured` finite.
   void Reset(const JointVector& q_measured, int64_t now_us) noexcept;
@@ -43,6 +53,19 @@ class ArmController {
   // Brakes within the limits and holds, latched until ResetFault.
   void Estop() noexcept;
 
+  // The arm cannot go on: brakes and is in Fault at once, latched until ResetFault. The first fault is kept;
+  // an ESTOP outranks it.
+  void Fail(Fault fault) noexcept;
+
+  // Whether the arm answers and its readings are fresh; true until told otherwise. While it is not, the
+  // reference slows down and holds, commands are heard but move nothing, and after 2 s it is a fault
+  // (kStaleStatus).
+  void SetLink(bool ok) noexcept { link_ok_ = ok; }
+
+  // The reference starts anew from the measured pose (finite): the arm had stopped on its own. Only at rest
+  // and not in command of the motion (Idle, Holding, Fault, Stopped); otherwise false and nothing happens.
+  bool Rebase(const JointVector& q_measured) noexcept;
+
   // From Fault or Stopped to Holding; only `session` (> 0) may command next. Until it has, another RESET may
   // name another one. Does nothing in other states.
   void ResetFault(int64_t session) noexcept;
@@ -53,21 +76,32 @@ class ArmController {
   // Whether a session is in command: then nobody may start the plant over.
   bool Busy(int64_t now_us) const noexcept;
 
-  // The reference for the servos: [rad], [rad/s].
+  // The reference for the servos: [rad], [rad/s], [rad/s^2].
   const JointVector& q_ref() const noexcept { return filter_.position(); }
   const JointVector& dq_ref() const noexcept { return filter_.velocity(); }
+  const JointVector& ddq_ref() const noexcept { return filter_.acceleration(); }
   bool gripper_closed() const noexcept { return gripper_closed_; }
   ArmState state() const noexcept { return state_; }
+  const CommandFilter& filter() const noexcept { return filter_; }
 
   // Fills session, q_commanded, gripper_closed, mode, state, fault, last_command_seq, refused.
   void FillStatus(ArmStatus& status) const noexcept;
+  // Fills all but what was measured.
+  void FillRecord(TickRecord& record) const noexcept;
 
  private:
   bool CommandIsValid(int64_t now_us) const noexcept {
     return lifetime_us_ > 0 && now_us - received_us_ <= lifetime_us_;
   }
 
-  JointFilter filter_;
+  // Ticks until the next command of the running stream is due.
+  int TicksToNext(int64_t now_us, int64_t since_last_us) noexcept;
+  bool Moving() const noexcept { return state_ == ArmState::kTracking || state_ == ArmState::kAligning; }
+  bool Near() const noexcept;
+  void Stop(ArmState state, Fault fault) noexcept;
+
+  CommandFilter filter_;
+  ArmSafety safety_;
   ArmState state_ = ArmState::kIdle;
   Fault fault_ = Fault::kNone;
   ArmMode mode_ = ArmMode::kHold;
@@ -78,12 +112,18 @@ class ArmController {
   int64_t last_seq_ = 0;
   bool has_seq_ = false;  // last_seq_ is of session_
 
+  int64_t period_us_ = kPolicyPeriodUs;  // of the session's commands, as they came lately
+  int64_t due_us_ = 0;                   // when the next one is expected
   JointVector q_target_ = JointVector::Zero();
   JointVector dq_max_ = JointVector::Zero();
   int64_t received_us_ = 0;
   int64_t lifetime_us_ = 0;  // 0: no command is valid
   bool stale_ = false;       // slows or holds because commands stopped coming
+  bool link_ok_ = true;
+  bool unlinked_ = false;  // holds without a link, since then:
+  int64_t unlinked_since_us_ = 0;
   int64_t held_since_us_ = 0;
+  int64_t last_tick_us_ = 0;
 
   std::array<int32_t, kNumRefusals> refused_{};
 };

@@ -17,6 +17,11 @@ class Perception(StrEnum):
     truth = "truth"
 
 
+class Arm(StrEnum):
+    plant = "plant"
+    lite6 = "lite6"
+
+
 class Clock(StrEnum):
     lockstep = "lockstep"
     wall = "wall"
@@ -30,8 +35,12 @@ def register(app: typer.Typer) -> None:
             Perception, typer.Option(help="Where object poses come from: cameras and tags, or the simulator itself.")
         ] = Perception.tags,
         clock: Annotated[
-            Clock, typer.Option(help="lockstep: repeatable, as fast as it goes; wall: real time.")
-        ] = Clock.lockstep,
+            Clock | None,
+            typer.Option(help="lockstep (default): repeatable, as fast as it goes; wall: real time, as a real arm's."),
+        ] = None,
+        arm: Annotated[
+            Arm, typer.Option(help="plant: MuJoCo; lite6: the arm's driver and a fake controller before MuJoCo.")
+        ] = Arm.plant,
         seed: Annotated[int, typer.Option(help="Where the objects lie.", min=0, max=2**62)] = 0,
         out: Annotated[Path, typer.Option(help="Folder for summary, pictures, video and logs.")] = Path("out/demo"),
         viewer: Annotated[bool, typer.Option("--viewer", help="Open a window on the simulation.")] = False,
@@ -40,7 +49,10 @@ def register(app: typer.Typer) -> None:
         """Play a learned task in simulation: plant, perception and control as separate C++ programs."""
         from intabs import play
 
-        options = play.Options(task, perception.value, clock.value, seed, out=out, viewer=viewer)
+        if arm == Arm.lite6 and clock == Clock.lockstep:
+            raise UserError("--arm lite6 runs by the wall clock: leave out --clock lockstep")
+        rule = clock or (Clock.wall if arm == Arm.lite6 else Clock.lockstep)
+        options = play.Options(task, perception.value, rule.value, arm.value, seed, out=out, viewer=viewer)
         with Progress("demo", total=1.0) as progress:
             summary, why = play.play(options, progress.update)
         write_json(out / "summary.json", summary)

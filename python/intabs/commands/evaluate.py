@@ -20,9 +20,7 @@ class Unit(StrEnum):
 def register(app: typer.Typer) -> None:
     @app.command()
     def evaluate(
-        runs: Annotated[
-            list[Path], typer.Argument(help="Runs of `intabs train`: seeds; or a weights folder.")
-        ],
+        runs: Annotated[list[Path], typer.Argument(help="Runs of `intabs train`: seeds; or a weights folder.")],
         data: Annotated[Path, typer.Option(help="Demonstrations, HDF5; those of mask/valid are scored.")],
         methods: Annotated[str, typer.Option(help="Comma-separated.")] = "intabs,pca,still,mean",
         unit: Annotated[Unit, typer.Option(help="Single segments, or whole demonstrations in a chain.")] = Unit.segment,

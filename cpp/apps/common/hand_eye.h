@@ -1,0 +1,58 @@
+// X_WB, the arm base in W, from a calibration file (tools/calibrate hand-eye) or the configuration of
+// intabs_perception that names one.
+#pragma once
+
+#include <yaml-cpp/yaml.h>
+
+#include <array>
+#include <cmath>
+#include <stdexcept>
+#include <string>
+
+#include "intabs/core/pose.h"
+
+namespace intabs {
+
+// Throws std::runtime_error, one line with file and key. Identity where the file says nothing of it.
+inline Pose LoadHandEye(const std::string& file) {
+  YAML::Node root;
+  try {
+    root = YAML::LoadFile(file);
+  } catch (const YAML::BadFile&) {
+    throw std::runtime_error(file + ": cannot be read");
+  } catch (const YAML::Exception& e) {
+    throw std::runtime_error(file + ": not readable as YAML: line " + std::to_string(e.mark.line + 1) + ": " +
+                             e.msg);
+  }
+  if (!root.IsMap()) throw std::runtime_error(file + ": expected a map of values");
+  if (const YAML::Node other = root["calibration"]) {
+    if (!other.IsScalar()) throw std::runtime_error(file + ": calibration: expected a file name");
+    const std::string name = other.Scalar();
+    return LoadHandEye(name.starts_with('/') ? name : file.substr(0, file.rfind('/') + 1) + name);
+  }
+  const YAML::Node node = root["X_WB"];
+  if (!node) return {};
+  const auto numbers = [&](const char* key, auto& out) {
+    const YAML::Node list = node.IsMap() ? node[key] : YAML::Node();
+    const std::string where =
+        file + ": X_WB." + key + ": expected " + std::to_string(out.size()) + " numbers";
+    if (!list || !list.IsSequence() || list.size() != out.size()) throw std::runtime_error(where);
+    for (size_t i = 0; i < out.size(); ++i) {
+      try {
+        out[i] = list[i].as<double>();
+      } catch (const YAML::Exception&) {
+        throw std::runtime_error(where);
+      }
+    }
+  };
+  std::array<double, 3> p;
+  std::array<double, 4> q;
+  numbers("p", p);
+  numbers("q", q);
+  const Eigen::Quaterniond rotation(q[0], q[1], q[2], q[3]);
+  if (!(std::abs(rotation.norm() - 1) < 1e-3))
+    throw std::runtime_error(file + ": X_WB.q: (w x y z) has not norm 1");
+  return {{p[0], p[1], p[2]}, rotation.normalized()};
+}
+
+}  // namespace intabs

@@ -1,0 +1,28 @@
+"""The whole demo by way of the arm's driver: control -> driver -> wire protocol -> fake controller -> plant."""
+
+import json
+
+import pytest
+from lite6_bench import need_lite6
+
+from bench import need_programs
+from intabs import play
+from intabs.errors import UserError
+
+need_programs()
+need_lite6()
+
+
+def test_a_learned_task_is_played_through_the_wire_protocol(tmp_path):
+    options = play.Options(perception="truth", clock="wall", arm="lite6", spread=0, out=tmp_path)
+    try:
+        summary, why = play.play(options, lambda *_: None)
+    except UserError as e:
+        pytest.fail(str(e))
+    controller = json.loads((tmp_path / "logs" / "fake_lite6.json").read_text())
+    assert controller["servo_requests"] > 0
+    assert controller["servo_rejected"] == controller["error"] == 0
+    if not summary["success"] and "silent" in why:
+        pytest.skip(f"skipped: this machine is too busy for the wall clock: {why}")
+    assert summary["success"], why
+    assert (tmp_path / "strip.png").exists()
