@@ -4,7 +4,8 @@ namespace intabs {
 
 Status SkillController::Tick(const ArmStatus& status, const ObjectPoses& poses, ArmCommand& command) noexcept {
   const bool driver_left = status.state == ArmState::kFault || status.state == ArmState::kStopped ||
-                           (status.session != 0 && status.session != session_ && status.state == ArmState::kTracking);
+                           (status.session != 0 && status.session != session_ &&
+                            (status.state == ArmState::kTracking || status.state == ArmState::kAligning));
   if (driver_left) player_.Abort(EndReason::kRefused);
   if (status.utime - poses.exposure_utime > kMaxPoseAgeUs) player_.Abort(EndReason::kStalePoses);
 
