@@ -136,7 +136,7 @@ class Control {
   // The policy knows the arm's base alone. In the plant that is W.
   void OnPoses(const ObjectPoses& p) {
     // Late ones. After a reset of the plant time starts again, the frames go on counting.
-    if (poses_ && p.exposure_utime < poses_->exposure_utime && p.frame_seq < poses_->frame_seq) return;
+    if (poses_ && p.exposure_utime < poses_->exposure_utime && p.frame_seq <= poses_->frame_seq) return;
     poses_ = p;
     if (!X_BW_) return;
     for (TrackedObject& o : poses_->objects) {

@@ -164,7 +164,8 @@ void Plant::OnCommand(const ArmCommand& c) {
 bool Plant::Moves() const {
   const ArmState state = sim_.controller().state();
   const bool alive = !Lockstep() || MonotonicUs() - answered_us_ < kStrangerUs;
-  return alive && (state == ArmState::kTracking || state == ArmState::kSlowing);
+  return alive &&
+         (state == ArmState::kAligning || state == ArmState::kTracking || state == ArmState::kSlowing);
 }
 
 void Plant::OnStatus(const ArmStatus& s) { heard_other_ |= s.source != source_; }
