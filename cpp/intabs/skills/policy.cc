@@ -1,6 +1,8 @@
 #include "intabs/skills/policy.h"
 
+#include <algorithm>
 #include <chrono>
+#include <cmath>
 #include <stdexcept>
 
 namespace intabs {
@@ -39,9 +41,10 @@ Policy Policy::FromWeights(const WeightsFile& weights, const ArmModel& arm, cons
          "policy period " + std::to_string(period) + " us, this program runs at " + std::to_string(kPolicyPeriodUs));
   Policy policy(arm, Network(weights, "pi", options));
   const NetworkSpec& spec = manifest.network("pi");
-  Demand(spec.input == kStateDim + kLatentDim, dir,
-         "pi takes " + std::to_string(spec.input) + " inputs, the state layout and z give " +
-             std::to_string(kStateDim + kLatentDim));
+  policy.with_phase_ = spec.input == kPolicyInputDim;
+  Demand(policy.with_phase_ || spec.input == kStateDim + kLatentDim, dir,
+         "pi takes " + std::to_string(spec.input) + " inputs, the state layout, z and the phase give " +
+             std::to_string(kPolicyInputDim));
   policy.agent_head_ = policy.pi_.HeadIndex("agent");
   policy.environment_head_ = policy.pi_.HeadIndex("environment");
   Demand(policy.pi_.head_size(policy.agent_head_) == kAgentActionDim &&
@@ -67,11 +70,21 @@ Policy Policy::FromWeights(const WeightsFile& weights, const ArmModel& arm, cons
   return policy;
 }
 
-Status Policy::Step(const Observation& observation, const LatentVector& z, Action& action) noexcept {
+Status Policy::Step(const Observation& observation, const LatentVector& z, float phase, Action& action) noexcept {
   StateVector s;
   if (const Status status = AssembleState(arm_, observation, s); status != Status::kOk) return status;
   normalizer_.Apply(s);
-  input_ << s, z;
+  input_.head<kStateDim>() = s;
+  if (with_phase_) {
+    input_.segment<kLatentDim>(kStateDim + kPhaseBasis) = z;
+    for (int k = 0; k < kPhaseBasis; ++k) {
+      const float b = std::max(0.f, 1.f - std::abs(phase * (kPhaseBasis - 1) - static_cast<float>(k)));
+      input_[kStateDim + k] = b;
+      input_.segment<kLatentDim>(kStateDim + kPhaseBasis + kLatentDim * (1 + k)) = b * z;
+    }
+  } else {
+    input_.segment<kLatentDim>(kStateDim) = z;
+  }
   const auto before = std::chrono::steady_clock::now();
   if (const Status status = pi_.Step(input_.data()); status != Status::kOk) return status;
   infer_us_ = std::chrono::duration<float, std::micro>(std::chrono::steady_clock::now() - before).count();

@@ -20,6 +20,11 @@ struct Normalizer {
   }
 };
 
+// Hat functions at kPhaseBasis places of a skill's phase: what lets pi's linear path say a course in time.
+inline constexpr int kPhaseBasis = 5;
+// What pi takes: [s, b(phase), z, z b_0(phase), ..., z b_4(phase)], b of a skill's phase in [0, 1]; older weights [s, z].
+inline constexpr int kPolicyInputDim = kStateDim + kPhaseBasis + kLatentDim * (1 + kPhaseBasis);
+
 struct Action {
   JointVector dq_step = JointVector::Zero();  // step of the joint target [rad a tick]
   bool gripper_closed = false;
@@ -36,7 +41,8 @@ class Policy {
 
   void Reset() noexcept { pi_.Reset(); }
   // Real-time safe. kInvalidInput if a reading or the output is not finite.
-  Status Step(const Observation& observation, const LatentVector& z, Action& action) noexcept;
+  // phase: 0 at the skill's first tick, 1 at its last and after.
+  Status Step(const Observation& observation, const LatentVector& z, float phase, Action& action) noexcept;
   float infer_us() const noexcept { return infer_us_; }  // of the last Step, the network alone
 
  private:
@@ -47,8 +53,9 @@ class Policy {
   Normalizer normalizer_;
   Eigen::Matrix<float, kAgentActionDim, 1> agent_scale_;
   Eigen::Matrix<float, kEnvironmentActionDim, 1> environment_scale_;
-  Eigen::Matrix<float, kStateDim + kLatentDim, 1> input_;
+  Eigen::Matrix<float, kPolicyInputDim, 1> input_;
   int agent_head_ = 0, environment_head_ = 0;
+  bool with_phase_ = true;
   float infer_us_ = 0;
 };
 

@@ -7,7 +7,8 @@ Status SkillController::Tick(const ArmStatus& status, const ObjectPoses& poses, 
                            (status.session != 0 && status.session != session_ &&
                             (status.state == ArmState::kTracking || status.state == ArmState::kAligning));
   if (driver_left) player_.Abort(EndReason::kRefused);
-  if (status.utime - poses.exposure_utime > kMaxPoseAgeUs) player_.Abort(EndReason::kStalePoses);
+  const int64_t pose_age_us = status.utime - poses.exposure_utime;
+  if (pose_age_us > kPosesGoneUs) player_.Abort(EndReason::kStalePoses);
 
   command = ArmCommand{};
   command.utime = status.utime;
@@ -16,7 +17,9 @@ Status SkillController::Tick(const ArmStatus& status, const ObjectPoses& poses, 
   command.status_seq = status.seq;
   command.q_target = status.q_commanded;
   Status result = Status::kNotReady;
-  if (player_.playing()) {
+  if (player_.playing() && pose_age_us > kMaxPoseAgeUs) {
+    // The plan goes on when there are newer ones; until then nobody moves blindly.
+  } else if (player_.playing()) {
     Observation observation;
     observation.q = status.q;
     observation.gripper_closed = status.gripper_closed;

@@ -6,7 +6,8 @@
 
 namespace intabs {
 
-inline constexpr int64_t kMaxPoseAgeUs = 500000;  // older object poses end the plan: perception is gone
+inline constexpr int64_t kMaxPoseAgeUs = 500000;   // with older object poses the arm holds and the plan waits ...
+inline constexpr int64_t kPosesGoneUs = 2500000;   // ... and from here on it ends: perception is gone
 
 class SkillController {
  public:
@@ -17,8 +18,9 @@ class SkillController {
   void Abort(EndReason why) noexcept { player_.Abort(why); }
 
   // Real-time safe. Always fills a command that is safe to send: while nothing is played it asks the driver to hold.
-  // Returns what the player said. Ends the plan (see PlayerStatus) if poses are older than kMaxPoseAgeUs or if the
-  // driver is in fault, stopped, or obeys another session.
+  // Returns what the player said. While poses are older than kMaxPoseAgeUs the arm is asked to hold and the plan waits
+  // (kNotReady). Ends the plan (see PlayerStatus) when they are older than kPosesGoneUs, or if the driver is in fault,
+  // stopped, or obeys another session.
   Status Tick(const ArmStatus& status, const ObjectPoses& poses, ArmCommand& command) noexcept;
 
   SkillPlayer& player() noexcept { return player_; }

@@ -2,6 +2,16 @@
 
 namespace intabs {
 
+namespace {
+
+// The skill is expected to last the mean of its bounds.
+float Phase(const Skill& skill, int tick) {
+  const int last = (skill.min_ticks + skill.max_ticks) / 2 - 1;
+  return last < 1 || tick >= last ? (tick > 0 ? 1.f : 0.f) : static_cast<float>(tick) / static_cast<float>(last);
+}
+
+}  // namespace
+
 Status SkillPlayer::Start(int64_t plan_id, std::span<const Skill> skills) noexcept {
   if (skills.empty() || skills.size() > kMaxSkills) return Status::kOutOfRange;
   for (const Skill& s : skills) {
@@ -29,7 +39,8 @@ Status SkillPlayer::Tick(const Observation& observation, const JointVector& q_co
   }
   if (tick_ == 0) policy_.Reset();  // trained on segments that start from a zero state
   Action action;
-  const Status status = policy_.Step(observation, skills_[status_.skill_index].z, action);
+  const Skill& skill = skills_[status_.skill_index];
+  const Status status = policy_.Step(observation, skill.z, Phase(skill, tick_), action);
   if (status != Status::kOk) {
     Abort(EndReason::kBadInput);
     return status;

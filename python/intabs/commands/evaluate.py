@@ -20,9 +20,13 @@ class Unit(StrEnum):
 def register(app: typer.Typer) -> None:
     @app.command()
     def evaluate(
-        runs: Annotated[list[Path], typer.Argument(help="Runs of `intabs train`: seeds; or a weights folder.")],
+        runs: Annotated[
+            list[Path], typer.Argument(help="Runs of `intabs train`, several of a kind are seeds; or a weights folder.")
+        ],
         data: Annotated[Path, typer.Option(help="Demonstrations, HDF5; those of mask/valid are scored.")],
-        methods: Annotated[str, typer.Option(help="Comma-separated.")] = "intabs,pca,still,mean",
+        methods: Annotated[
+            str, typer.Option(help="Comma-separated: intabs, tvi, tvi-agent, pca, hdmp, hdmp-faithful, still, mean.")
+        ] = "",
         unit: Annotated[Unit, typer.Option(help="Single segments, or whole demonstrations in a chain.")] = Unit.segment,
         json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
     ) -> None:
@@ -36,9 +40,25 @@ def register(app: typer.Typer) -> None:
 
         names = [m.strip() for m in methods.split(",") if m.strip()]
         with Progress("evaluate", total=0) as progress:
-            figures = run(runs, data, names, unit.value, progress.update)
+            figures = run(runs, data, names or None, unit.value, progress=progress.update)
         write_json(json, figures)
         print(f"{unit.value}, {figures['seeds']} seed{'s' * (figures['seeds'] > 1)}")
         print(f"{'':14}" + "".join(f"{k:>13}" for k in FIGURES))
         for name, f in figures["methods"].items():
-            print(f"{name:14}" + "".join(f"{f[k]:13.4f}" for k in FIGURES) + f"   n {f['n']}")
+            sd = f"   sd {f['sd']:.4f}" if f["sd"] else ""
+            print(f"{name:14}" + "".join(f"{f[k]:13.4f}" for k in FIGURES) + f"   n {f['n']}{sd}")
+        for name, f in figures["ratios"].items():
+            text = "".join(f"  {k} {f[k][0]:.2f} ({f[k][1]:.2f}-{f[k][2]:.2f})" for k in FIGURES)
+            print(f"{next(iter(figures['methods']))} / {name}:{text}")
+        if "knn" in figures:
+            k = figures["knn"]
+            print(
+                f"5-NN over z: {k['accuracy']:.3f} of {k['n']} ({k['classes']} kinds; the thesis' protocol "
+                f"{k['thesis_protocol']:.3f}); majority {k['majority']:.3f}, untrained encoder {k['untrained']:.3f}, "
+                f"PCA-16 {k['pca']:.3f}"
+            )
+            b = figures["boundaries"]
+            print(
+                f"boundaries: precision {b['precision']:.3f}, recall {b['recall']:.3f}, F1 {b['f1']:.3f}; "
+                f"best fixed cut {b['fixed_cut_f1']:.3f}, mean training times {b['mean_time_f1']:.3f}"
+            )

@@ -8,15 +8,15 @@ from typing import Protocol
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intabs.evaluate.metrics import Motion, Scaling, joined
+from intabs.evaluate.metrics import Motion, Sample, Scaling, joined
 from intabs.model.kinematics import log_so3
 
 
 class Method(Protocol):
     name: str
 
-    def reconstruct(self, motion: Motion, cuts: list[int]) -> Motion:
-        """Cuts: first 0, last len(motion) - 1. The answer's first state is the motion's."""
+    def reconstruct(self, of: Sample, cuts: list[int]) -> Motion:
+        """Cuts: first 0, last len(of.motion) - 1. The answer's first state is the motion's."""
 
 
 class Still:
@@ -24,8 +24,8 @@ class Still:
 
     name = "still"
 
-    def reconstruct(self, motion: Motion, cuts: list[int]) -> Motion:
-        return motion[np.zeros(len(motion), int)]
+    def reconstruct(self, of: Sample, cuts: list[int]) -> Motion:
+        return of.motion[np.zeros(len(of.motion), int)]
 
 
 # --- displacements: what PCA and the mean describe --------------------------------------------------------------------
@@ -114,12 +114,12 @@ class Pca:
         """(16,) or fewer numbers."""
         return np.concatenate([U @ (x - m) for x, (m, U) in zip(self.shape.split(segment), self.parts, strict=True)])
 
-    def reconstruct(self, motion: Motion, cuts: list[int]) -> Motion:
+    def reconstruct(self, of: Sample, cuts: list[int]) -> Motion:
         def piece(start: Motion, segment: Motion, steps: int) -> Motion:
             back = [m + (U @ (x - m)) @ U for x, (m, U) in zip(self.shape.split(segment), self.parts, strict=True)]
             return self.shape.joined(start, *back, steps)
 
-        return chained(motion, cuts, piece)
+        return chained(of.motion, cuts, piece)
 
 
 class Mean:
@@ -137,6 +137,6 @@ class Mean:
         rows = [self.shape.split(m) for m in motions]
         return self.shape.N, np.mean([r[0] for r in rows], 0), np.mean([r[1] for r in rows], 0)
 
-    def reconstruct(self, motion: Motion, cuts: list[int]) -> Motion:
+    def reconstruct(self, of: Sample, cuts: list[int]) -> Motion:
         self.shape.N, agent, environment = self.segment if len(cuts) == 2 else self.whole
-        return self.shape.joined(motion[:1], agent, environment, len(motion))
+        return self.shape.joined(of.motion[:1], agent, environment, len(of.motion))

@@ -2,123 +2,152 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
 
-from intabs import _core, paths
-from intabs.data.demos import Demo, load_demos
-from intabs.data.features import Normalizer, Trajectory, trajectory
+from intabs import paths
+from intabs.data.demos import load_demos
 from intabs.errors import UserError
 from intabs.evaluate.baselines import Mean, Pca, Still
+from intabs.evaluate.boundaries import score_boundaries
+from intabs.evaluate.hdmp import FaithfulHdmp, Hdmp
+from intabs.evaluate.knn import score_neighbours
 from intabs.evaluate.learned import Learned
-from intabs.evaluate.metrics import Motion, Scaling, errors, fixed_cuts
-from intabs.model.kinematics import rotation
+from intabs.evaluate.metrics import Scaling, errors, fixed_cuts, sample
 
-METHODS = ("intabs", "pca", "still", "mean")
+KINDS = {"split": "intabs", "joint": "tvi", "agent": "tvi-agent"}
+METHODS = ("intabs", "tvi", "tvi-agent", "pca", "hdmp", "hdmp-faithful", "still", "mean")
 FIGURES = ("all", "balanced", "joints", "position", "orientation")
 
 
-@dataclass
-class Sample:
-    motion: Motion
-    trajectory: Trajectory
-
-    def piece(self, a: int, b: int) -> Sample:
-        """Ticks a to b, both of them in."""
-        t = self.trajectory
-        cut = Trajectory(t.readings.map(lambda x: x[a:b]), t.state[a:b], t.agent_action[a:b], t.environment_action[a:b])
-        return Sample(self.motion[a : b + 1], cut)
-
-
-def sample(demo: Demo, arm) -> Sample:
-    arrays = demo.arrays()
-    gripper = np.where(arrays.agent[:, 6:7] > 0.5, 1.0, -1.0)
-    motion = Motion(
-        np.concatenate([arrays.agent[:, :6], gripper], 1),
-        arrays.objects[..., :3],
-        rotation(arrays.objects[..., 3:]),
-        arrays.environment,
-        arrays.valid,
-    )
-    return Sample(motion, trajectory(demo, arm))
-
-
-def load_learned(source: Path, arm) -> tuple[Learned, int, str]:
-    """A run of `intabs train` or a folder of weights: the method, its typical length of a segment, hash of its data."""
-    import torch
-
-    from intabs.model.networks import InteractionAbstractions
+def load_learned(source: Path) -> Learned:
+    """A run of `intabs train` or a folder of weights."""
     from intabs.train.trainer import load_model
 
     if (source / "checkpoint.pt").exists():
-        model, normalizer, checkpoint = load_model(source)
-        config, sha256 = checkpoint["config"], checkpoint["data"]["sha256"]
+        model, about = load_model(source)
+        sha256 = about["data"]["sha256"]
     elif (source / "manifest.json").exists():
-        from safetensors.torch import load_file
+        from intabs.train.export import load_weights
 
-        manifest = json.loads((source / "manifest.json").read_text())
-        config, sha256 = manifest["training"]["config"], manifest["training"]["data_sha256"]
-        model = InteractionAbstractions(config["model"])
-        model.load_tensors(load_file(str(source / "weights.safetensors")))
-        normalizer = Normalizer.from_dict(manifest["normalizer"])
+        model, manifest = load_weights(source)
+        about, sha256 = manifest["training"], manifest["training"]["data_sha256"]
     else:
         raise UserError(f"{source}: neither a run of `intabs train` (checkpoint.pt) nor a folder of weights")
     torch.set_num_threads(1)
-    segment = int(round(sum(config["objective"]["segment"]) / 2)) + 1  # ticks, both ends in
-    return Learned("intabs", model, normalizer, arm), segment, sha256
+    return Learned(KINDS[model.kind], model, about["config"], sha256)
+
+
+def find_sources(sources: list[Path]) -> list[Path]:
+    """Names of shipped weights stand for their folders; the baselines trained beside them come along."""
+    out = []
+    for source in sources:
+        if source.exists():
+            out.append(source)
+            continue
+        folder = paths.MODELS / "weights" / source
+        if not folder.exists():
+            raise UserError(f"{source}: no run of `intabs train` and no folder in models/weights")
+        beside = (folder.with_name(f"{folder.name}-{kind}") for kind in ("tvi", "tvi-agent"))
+        out += [folder, *(f for f in beside if f.exists())]
+    return out
 
 
 def evaluate(
     sources: list[Path],
     data: Path,
-    methods: list[str],
+    methods: list[str] | None,
     unit: str,
+    segment: int = 15,
     progress: Callable[[int, str], None] = lambda done, text: None,
 ) -> dict:
-    """Several sources are several seeds of one method. {methods: {name: {all, balanced, joints, position, orientation,
-    sd, n}}, seeds}: means over held-out demonstrations, or over all their segments; sd over seeds, of `all`."""
-    unknown = [m for m in methods if m not in METHODS]
+    """Several sources of a kind are several seeds of one method; methods None: all that there are.
+
+    {methods: {name: {all, balanced, joints, position, orientation, sd, n}}, knn, boundaries, ratios, seeds}: means
+    over held-out demonstrations, or over all their segments; sd over seeds, of `all`. ratios: of the first method's
+    figures to the others', with 95 % intervals (bootstrap over held-out demonstrations, paired).
+    """
+    unknown = [m for m in methods or () if m not in METHODS]
     if unknown:
         raise UserError(f"--methods {unknown[0]}: known are {', '.join(METHODS)}")
-    arm = _core.ArmModel.lite6()
-    sources = [s if s.exists() else paths.MODELS / "weights" / s for s in sources]
-    learned = [load_learned(s, arm) for s in sources]
-    segment = learned[0][1]
-    train = [sample(d, arm).motion for d in load_demos(data, "train")[0]]
-    held_out = [sample(d, arm) for d in load_demos(data, "valid")[0]]
-    if not held_out:
+    learned: dict[str, list[Learned]] = {}
+    for source in find_sources(sources):
+        method = load_learned(source)
+        learned.setdefault(method.name, []).append(method)
+    train_demos, held_out_demos = load_demos(data, "train")[0], load_demos(data, "valid")[0]
+    if not held_out_demos:
         raise UserError(f"{data}: holds nothing out (mask/valid is empty); `intabs data split` makes one")
+    train = [sample(d).motion for d in train_demos]
+    held_out = [sample(d) for d in held_out_demos]
     scaling = Scaling.fit(train)
     pieces = []
-    for s in held_out:
+    for i, s in enumerate(held_out):
         cuts = fixed_cuts(len(s.motion), segment)
         if unit == "whole":
-            pieces.append((s, cuts))
+            pieces.append((i, s, cuts))
         else:
-            pieces += [(s.piece(a, b), [0, b - a]) for a, b in zip(cuts, cuts[1:], strict=False)]
+            pieces += [(i, s.piece(a, b), [0, b - a]) for a, b in zip(cuts, cuts[1:], strict=False)]
     make = {
         "still": lambda: [Still()],
         "mean": lambda: [Mean(train, scaling, segment)],
         "pca": lambda: [Pca(train, scaling, segment)],
-        "intabs": lambda: [x[0] for x in learned],
+        "hdmp-faithful": lambda: [FaithfulHdmp()],
+        "hdmp": lambda: [Hdmp()],
+        **{name: lambda found=found: found for name, found in learned.items()},
     }
-    figures: dict = {}
+    others = (m for m in METHODS if m not in KINDS.values() and (m != "hdmp" or Hdmp.installed()))
+    names = methods or [*learned, *others]
+    missing = [m for m in names if m not in make]
+    if missing:
+        raise UserError(f"--methods {missing[0]}: no run of that kind is given; have {', '.join(learned)}")
+    rows: dict[str, list[list[dict]]] = {}  # method -> seeds -> pieces
     done = 0
-    for name in methods:
-        seeds = []
+    for name in names:
+        rows[name] = []
         for method in make[name]():
-            rows = []
-            for s, cuts in pieces:
-                extra = (s.trajectory,) if isinstance(method, Learned) else ()
-                rows.append(errors(method.reconstruct(s.motion, cuts, *extra), s.motion, scaling))
+            seed = []
+            for _, s, cuts in pieces:
+                seed.append(errors(method.reconstruct(s, cuts), s.motion, scaling))
                 done += 1
                 progress(done, name)
-            seeds.append({k: float(np.mean([r[k] for r in rows])) for k in FIGURES})
-        figures[name] = {k: float(np.mean([s[k] for s in seeds])) for k in FIGURES}
-        figures[name]["sd"] = float(np.std([s["all"] for s in seeds], ddof=1)) if len(seeds) > 1 else 0.0
-        figures[name]["n"] = len(pieces)
-    return {"methods": figures, "unit": unit, "segment": segment, "seeds": len(sources)}
+            rows[name].append(seed)
+    figures = {}
+    for name, seeds in rows.items():
+        figures[name] = {k: float(np.mean([r[k] for seed in seeds for r in seed])) for k in FIGURES}
+        means = [np.mean([r["all"] for r in seed]) for seed in seeds]
+        figures[name] |= {"sd": float(np.std(means, ddof=1)) if len(means) > 1 else 0.0, "n": len(pieces)}
+    out = {
+        "methods": figures,
+        "unit": unit,
+        "segment": segment,
+        "seeds": max(len(x) for x in learned.values()),
+        "ratios": ratios(rows, [i for i, _, _ in pieces]),
+    }
+    main = learned.get("intabs") or next(iter(learned.values()))
+    if all("labels" in d.extra for d in train_demos + held_out_demos):
+        pca = Pca(train, scaling, segment)
+        out["knn"] = score_neighbours(main, pca, train_demos, held_out_demos)
+        out["boundaries"] = score_boundaries(main[0], train_demos, held_out_demos)
+    return out
+
+
+def ratios(rows: dict[str, list[list[dict]]], demo: list[int], draws: int = 2000) -> dict:
+    """Of the first method to each other one: {method: {figure: [ratio, low, high]}}."""
+    first, *others = rows
+    demo = np.array(demo)
+    groups = [np.flatnonzero(demo == i) for i in np.unique(demo)]
+    rng = np.random.default_rng(0)
+    picks = [np.concatenate([groups[i] for i in rng.integers(len(groups), size=len(groups))]) for _ in range(draws)]
+    values = {name: {k: np.mean([[r[k] for r in seed] for seed in rows[name]], 0) for k in FIGURES} for name in rows}
+    out = {}
+    for name in others:
+        out[name] = {}
+        for k in FIGURES:
+            a, b = values[first][k], values[name][k]
+            drawn = [a[p].mean() / max(b[p].mean(), 1e-12) for p in picks]
+            low, high = np.quantile(drawn, [0.025, 0.975])
+            out[name][k] = [float(a.mean() / max(b.mean(), 1e-12)), float(low), float(high)]
+    return out

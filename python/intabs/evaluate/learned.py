@@ -6,53 +6,39 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from intabs.data.features import Normalizer, Trajectory
-from intabs.evaluate.metrics import Motion, joined
-from intabs.model import kinematics
-from intabs.model.networks import InteractionAbstractions
+from intabs.evaluate.metrics import Motion, Sample, joined, motion_of
+from intabs.model.networks import InteractionAbstractions, encoder_inputs
 
 
 class Learned:
-    """arm: intabs._core.ArmModel. `prepare` must have been given the trajectory of a motion before it is rebuilt."""
-
-    def __init__(self, name: str, model: InteractionAbstractions, normalizer: Normalizer, arm):
-        self.name, self.model, self.normalizer = name, model.eval(), normalizer
-        self.arm = kinematics.Arm(arm)
-
-    def encode(self, trajectory: Trajectory, a: int, b: int) -> torch.Tensor:
-        """(1, 16), the mean of z for ticks a..b-1. trajectory: normalised."""
-        piece = (trajectory.state, trajectory.agent_action, trajectory.environment_action)
-        with torch.no_grad():
-            return self.model.encode(*(torch.from_numpy(np.ascontiguousarray(x[None, a:b], "f4")) for x in piece))[0]
-
-    def reconstruct(self, motion: Motion, cuts: list[int], trajectory: Trajectory) -> Motion:
-        """trajectory: of the same ticks as `motion`, not normalised."""
-        normalized = self.normalizer.normalize(trajectory)
-        parts = [motion[:1]]
-        for a, b in zip(cuts, cuts[1:], strict=False):
-            parts.append(self.play(parts[-1][-1:], self.encode(normalized, a, b), b - a))
-        return joined(parts)
+    def __init__(self, name: str, model: InteractionAbstractions, config: dict | None = None, data_sha256: str = ""):
+        self.name, self.model, self.config, self.data_sha256 = name, model.eval(), config, data_sha256
 
     @torch.no_grad()
-    def play(self, start: Motion, z: torch.Tensor, ticks: int) -> Motion:
-        """Kinematic: joints by a^r, objects by a^e, nothing of the truth. Gives the `ticks` states after `start`."""
-        n = self.normalizer
-        q = torch.from_numpy(start.agent[:, :6].astype("f4"))
-        gripper = torch.from_numpy(start.agent[:, 6].astype("f4"))
-        p, R = torch.from_numpy(start.p.astype("f4")), torch.from_numpy(start.R.astype("f4"))
-        known = torch.from_numpy(start.valid.astype("f4"))
-        scale_r, scale_e = torch.from_numpy(n.agent_action_scale), torch.from_numpy(n.environment_action_scale)
-        memory, out = None, []
-        for _ in range(ticks):
-            raw, (_, R_WG) = kinematics.state_features(self.arm, q, gripper, p, R, known, known)
-            s = torch.from_numpy(n.normalize_state(raw.numpy()))
-            y, memory = self.model.pi.step(torch.cat([s, z], -1), memory)
-            q = q + y["agent"][:, :6] * scale_r[:6]
-            gripper = torch.where(y["agent"][:, 6] > 0, 1.0, -1.0)
-            moved = (y["environment"].clamp(-8, 8) * scale_e).unflatten(-1, (-1, 6)) * known[..., None]
-            p, R = kinematics.move_objects(p, R, R_WG, moved)
-            agent = torch.cat([q, gripper[:, None]], 1)
-            out.append((agent.numpy(), p.numpy(), R.numpy()))
-        agent, p, R = (np.concatenate(x) for x in zip(*out, strict=True))
-        repeat = np.zeros(ticks, int)
-        return Motion(agent, p, R, start.environment[repeat], start.valid[repeat])
+    def inputs(self, of: Sample) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the encoders see of a demonstration of T states, (T - 1, ...)."""
+        space, state = self.model.space, of.state
+        command = of.command / space.command_scale if of.command is not None else None
+        features, _ = space.features(state[:-1])
+        return encoder_inputs(space, features, command, *space.between(state[:-1], state[1:]))
+
+    @torch.no_grad()
+    def encode(self, inputs: tuple[torch.Tensor, torch.Tensor], pieces: list[tuple[int, int]]) -> torch.Tensor:
+        """Means of z of the pieces from tick a to tick b, (n, 16)."""
+        length = torch.tensor([b - a for a, b in pieces])
+        offset = torch.arange(int(length.max()))[None]
+        at = torch.tensor([a for a, _ in pieces])[:, None] + torch.minimum(offset, length[:, None] - 1)
+        return self.model.encode(*(x[at] for x in inputs), (offset < length[:, None]).float())[0]
+
+    @torch.no_grad()
+    def reconstruct(self, of: Sample, cuts: list[int]) -> Motion:
+        z = self.encode(self.inputs(of), list(zip(cuts, cuts[1:], strict=False)))
+        length = np.diff(cuts)
+        age = np.concatenate([np.arange(n) for n in length])
+        rolled, _ = self.model.rollout(
+            of.state[:1],
+            z.repeat_interleave(torch.from_numpy(length), 0)[None],
+            torch.from_numpy(age[None].astype("f4")),
+            torch.from_numpy(np.repeat(length, length)[None].astype("f4")),
+        )
+        return joined([of.motion[:1], motion_of(rolled[0])])

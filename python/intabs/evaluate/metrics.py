@@ -6,7 +6,11 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
+
+from intabs.data.demos import Demo
+from intabs.model.space import State, state_of
 
 GROUPS = ("joints", "position", "orientation")
 CONSTANT = 1e-4  # a dimension that varies by less over the training split is dropped
@@ -27,6 +31,11 @@ class Motion:
 
     def __getitem__(self, index: slice) -> Motion:
         return Motion(*(getattr(self, f.name)[index] for f in fields(self)))
+
+
+def motion_of(s: State) -> Motion:
+    parts = [x.detach().cpu().numpy().astype("f8") for x in (s.agent, s.p, s.R, s.environment)]
+    return Motion(*parts, s.valid.cpu().numpy() > 0)
 
 
 def joined(parts: list[Motion]) -> Motion:
@@ -105,3 +114,22 @@ def fixed_cuts(length: int, segment: int) -> list[int]:
     """Ticks where segments of about `segment` ticks begin and end: first 0, last length - 1; neighbours share one."""
     n = max(1, round((length - 1) / (segment - 1)))
     return np.linspace(0, length - 1, n + 1).round().astype(int).tolist()
+
+
+@dataclass
+class Sample:
+    """A demonstration or a piece of it, as every method takes it."""
+
+    motion: Motion
+    state: State
+    command: torch.Tensor | None  # a^r of the Lite 6 [rad a tick], gripper +-1
+
+    def piece(self, a: int, b: int) -> Sample:
+        """Ticks a to b, both of them in."""
+        command = self.command[a:b] if self.command is not None else None
+        return Sample(self.motion[a : b + 1], self.state[a : b + 1], command)
+
+
+def sample(demo: Demo) -> Sample:
+    state, command = state_of(demo)
+    return Sample(motion_of(state), state, torch.from_numpy(command) if command is not None else None)

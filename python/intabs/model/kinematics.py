@@ -63,22 +63,22 @@ class Arm(torch.nn.Module):
     def __init__(self, arm):
         super().__init__()
         frames = np.asarray(arm.frames)
-        self.register_buffer("p", torch.tensor(frames[:, :3], dtype=torch.float32), persistent=False)
-        self.register_buffer("R", torch.tensor(rotation(frames[:, 3:]), dtype=torch.float32), persistent=False)
+        X = np.zeros((len(frames), 4, 4))
+        X[:, :3, :3], X[:, :3, 3], X[:, 3, 3] = rotation(frames[:, 3:]), frames[:, :3], 1
+        self.register_buffer("X", torch.tensor(X, dtype=torch.float32), persistent=False)
 
     def tip(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """q (..., 6) -> p_WG (..., 3), R_WG (..., 3, 3)."""
-        c, s = torch.cos(q)[..., None], torch.sin(q)[..., None]
-        p, R = None, None
-        for i in range(q.shape[-1]):
-            if R is None:
-                p, R = self.p[i].expand(*q.shape[:-1], 3), self.R[i].expand(*q.shape[:-1], 3, 3)
-            else:
-                p = p + R @ self.p[i]
-                R = R @ self.R[i]
-            x, y, z = R.unbind(-1)
-            R = torch.stack([c[..., i, :] * x + s[..., i, :] * y, c[..., i, :] * y - s[..., i, :] * x, z], -1)
-        return p + R @ self.p[-1], R @ self.R[-1]
+        c, s = torch.cos(q), torch.sin(q)
+        o, one = torch.zeros_like(c), torch.ones_like(c)
+        turn = torch.stack([c, -s, o, o, s, c, o, o, o, o, one, o, o, o, o, one], -1).unflatten(-1, (4, 4))
+        link = self.X[:-1] @ turn  # all links at once: few large operations, not many small ones
+        while link.shape[-3] > 1:
+            n = link.shape[-3] // 2 * 2
+            pairs = link[..., 0:n:2, :, :] @ link[..., 1:n:2, :, :]
+            link = torch.cat([pairs, link[..., n:, :, :]], -3)
+        X = link[..., 0, :, :] @ self.X[-1]
+        return X[..., :3, 3], X[..., :3, :3]
 
 
 def state_features(
@@ -93,6 +93,25 @@ def state_features(
     columns = torch.cat([R[..., 0], R[..., 1]], -1)
     objects = torch.cat([p, columns, valid[..., None], p / (NEAR + p.abs())], -1) * known[..., None]
     return torch.cat([q, gripper[..., None], objects.flatten(-2)], -1), (p_WG, R_WG)
+
+
+def carried_motion(p_WG: Tensor, R_WG: Tensor, p_WG_next: Tensor, R_WG_next: Tensor, p_WO: Tensor) -> Tensor:
+    """How objects (..., S, 3) would move in a tick if they were held by the tip: (..., S, 6) like ObjectMotion, in the
+    tip's frame at its start. The rotation vector is first order: a tick turns by less than .1 rad."""
+    R_GW = R_WG.transpose(-1, -2)
+    turn = R_GW @ R_WG_next
+    p_GO = (R_GW[..., None, :, :] @ (p_WO - p_WG[..., None, :])[..., None])[..., 0]
+    step = (R_GW @ (p_WG_next - p_WG)[..., None])[..., 0]
+    moved = step[..., None, :] + (turn[..., None, :, :] @ p_GO[..., None])[..., 0] - p_GO
+    w = 0.5 * torch.stack(
+        [
+            turn[..., 2, 1] - turn[..., 1, 2],
+            turn[..., 0, 2] - turn[..., 2, 0],
+            turn[..., 1, 0] - turn[..., 0, 1],
+        ],
+        -1,
+    )
+    return torch.cat([moved, w[..., None, :].expand_as(moved)], -1)
 
 
 def move_objects(p_WO: Tensor, R_WO: Tensor, R_WG: Tensor, motion: Tensor) -> tuple[Tensor, Tensor]:

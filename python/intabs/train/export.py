@@ -14,34 +14,39 @@ import torch
 
 from intabs import _core
 from intabs.data.demos import Demo, load_demos
-from intabs.data.features import trajectory
 from intabs.errors import UserError
-from intabs.model.networks import InteractionAbstractions
+from intabs.evaluate.learned import Learned
+from intabs.evaluate.metrics import fixed_cuts, sample
+from intabs.model.networks import InteractionAbstractions, phase, phase_basis
+from intabs.model.space import Space, state_of
 from intabs.rollout import UNSEEN, Setting, run_trial
-from intabs.train.trainer import default_arm, load_model
+from intabs.train.trainer import load_model
 
 SCHEMA = 1
+SEGMENT = 14  # ticks of a skill of a plan
 GOLDEN_TICKS = 40
 TOLERANCE = 1e-5
 
 
-def encode_demo(model: InteractionAbstractions, normalizer, demo: Demo, cut: int) -> np.ndarray:
-    """The skills of a demonstration by a fixed cut: (n, 16) means of z. A rest of over half a cut is a skill too."""
-    t = normalizer.normalize(trajectory(demo, default_arm()))
-    length = len(t.state)
-    starts = list(range(0, length - cut // 2, cut))
-    rows = []
-    with torch.no_grad():
-        for a in starts:
-            b = min(a + cut, length)
-            mean, _ = model.encode(
-                *(
-                    torch.from_numpy(np.ascontiguousarray(x[None, a:b], "f4"))
-                    for x in (t.state, t.agent_action, t.environment_action)
-                )
-            )
-            rows.append(mean[0].numpy())
-    return np.stack(rows)
+def load_weights(folder: Path | str) -> tuple[InteractionAbstractions, dict]:
+    """The model of an exported folder, and its manifest."""
+    from safetensors.torch import load_file
+
+    folder = Path(folder)
+    manifest = json.loads((folder / "manifest.json").read_text())
+    if "space" not in manifest["training"]:
+        raise UserError(f"{folder}: was exported by an older version; export its run again")
+    space = Space.from_config(manifest["training"]["space"], _core.ArmModel.lite6())
+    space.load_normalizer(manifest["normalizer"])
+    model = InteractionAbstractions(manifest["training"]["config"]["model"], space)
+    model.load_tensors(load_file(str(folder / "weights.safetensors")))
+    return model.eval(), manifest
+
+
+def encode_demo(model: InteractionAbstractions, demo: Demo, cuts: list[int]) -> np.ndarray:
+    """The skills of a demonstration between these ticks: (n, 16) means of z."""
+    learned = Learned("intabs", model)
+    return learned.encode(learned.inputs(sample(demo)), list(zip(cuts, cuts[1:], strict=False))).numpy()
 
 
 def typical_demo(demos: list[Demo]) -> int:
@@ -55,12 +60,16 @@ def typical_demo(demos: list[Demo]) -> int:
     return int(np.argmin(distance + 10.0 * ~near_length + 100.0 * ~calm))
 
 
-def make_plan(model, normalizer, demo: Demo, cut: int, source: str) -> dict:
-    z = encode_demo(model, normalizer, demo, cut)
+def make_plan(model, demo: Demo, segment: int, source: str) -> dict:
+    cuts = fixed_cuts(len(demo), segment + 1)
+    z = encode_demo(model, demo, cuts)
+    ticks = np.diff(cuts).tolist()
     return {
         "task": demo.attrs["task"],
         "source_demo": source,
-        "skills": [{"z": [float(v) for v in row], "min_ticks": cut, "max_ticks": cut} for row in z],
+        "skills": [
+            {"z": [float(v) for v in row], "min_ticks": n, "max_ticks": n} for row, n in zip(z, ticks, strict=True)
+        ],
     }
 
 
@@ -69,7 +78,9 @@ def export(run: Path | str, out: Path | str, trials: int = 20) -> dict:
     Raises UserError if C++ and torch disagree by more than 1e-5."""
     from safetensors.torch import save_file
 
-    model, normalizer, checkpoint = load_model(run)
+    model, checkpoint = load_model(run)
+    if model.space.arm is None:
+        raise UserError(f"{run}: was not trained on the Lite 6; only its weights run in C++")
     out = Path(out)
     (out / "plans").mkdir(parents=True, exist_ok=True)
     tensors = {
@@ -93,17 +104,18 @@ def export(run: Path | str, out: Path | str, trials: int = 20) -> dict:
         }
     (out / "golden.json").write_text(json.dumps(golden))
 
-    cut = int(round(sum(checkpoint["config"]["objective"]["segment"]) / 2))
+    segment = SEGMENT
     manifest = {
         "schema_version": SCHEMA,
         "sha256": sha256,
         "networks": {net: module.spec for net, module in model.networks().items()},
         "state_layout": _core.STATE_LAYOUT,
-        "normalizer": normalizer.to_dict(),
+        "normalizer": model.space.normalizer(),
         "policy_period_us": 40000,
         "training": {
             "data_sha256": checkpoint["data"]["sha256"],
             "config": checkpoint["config"],
+            "space": checkpoint["space"],
             "seed": checkpoint["seed"],
             "steps": checkpoint["step"],
             "code_version": checkpoint["code_version"],
@@ -115,39 +127,42 @@ def export(run: Path | str, out: Path | str, trials: int = 20) -> dict:
     for task in sorted({d.attrs["task"] for d in demos}):
         of_task = [d for d in demos if d.attrs["task"] == task]
         k = typical_demo(of_task)
-        plan = make_plan(model, normalizer, of_task[k], cut, f"seed {of_task[k].attrs.get('seed')}")
+        plan = make_plan(model, of_task[k], segment, f"seed {of_task[k].attrs.get('seed')}")
         (out / "plans" / f"{task}.json").write_text(json.dumps(plan, indent=1))
 
     error = verify(out)
     if not error <= TOLERANCE:
         raise UserError(f"{out}: the C++ network differs from torch by {error:.2e}, more than {TOLERANCE:.0e}")
     held_out, _ = load_demos(checkpoint["data"]["path"], "valid")
-    formats = format_report(out, model, normalizer, held_out or demos, cut, trials)
+    formats = format_report(out, model, held_out or demos, trials)
     return {"sha256": sha256, "tensors": len(tensors), "max_abs_error": error, "formats": formats}
 
 
 FORMATS = ("fp32", "16", "8")
 
 
-def format_report(out: Path, model, normalizer, demos: list[Demo], cut: int, trials: int) -> dict:
+def format_report(out: Path, model, demos: list[Demo], trials: int) -> dict:
     """What each weight format costs: largest and root mean square difference of the joint steps from torch [rad a tick]
     on these demonstrations, segment by segment, and closed-loop success in the plant (truth, spread 2 cm)."""
     segments = []
     for demo in demos:
-        t = normalizer.normalize(trajectory(demo, default_arm()))
-        z = encode_demo(model, normalizer, demo, cut)
-        segments += [(t.state[k * cut : (k + 1) * cut], z[k]) for k in range(len(z))]
+        cuts = fixed_cuts(len(demo), SEGMENT + 1)
+        z = torch.from_numpy(encode_demo(model, demo, cuts))
+        with torch.no_grad():
+            features, _ = model.space.features(state_of(demo)[0])
+            for i, (a, b) in enumerate(zip(cuts, cuts[1:], strict=False)):
+                at = phase_basis(phase(torch.arange(b - a), torch.tensor(b - a)))
+                segments.append(model.policy_input(features[a:b], z[i].expand(b - a, -1), at))
     report = {}
     for form in FORMATS:
         pi = _core.Network.load(str(out), "pi", format=form)
         differences = []
-        for state, z in segments:
-            x = np.concatenate([state, np.tile(z, (len(state), 1))], axis=1)
+        for x in segments:
             with torch.no_grad():
-                want = model.act(torch.from_numpy(state)[None], torch.from_numpy(z)[None])[0][0].numpy()
+                want = model.pi(x[None])["agent"][0].numpy()
             pi.reset()
-            got = np.stack([pi.step(row)["agent"] for row in x])
-            differences.append((got - want)[:, :6] * normalizer.agent_action_scale[:6])
+            got = np.stack([pi.step(row)["agent"] for row in x.numpy()])
+            differences.append((got - want)[:, :6] * model.space.command_scale[:6].numpy())
         d = np.concatenate(differences)
         report[form] = {"max_rad": float(np.abs(d).max()), "rms_rad": float(np.sqrt((d**2).mean()))}
         if trials:

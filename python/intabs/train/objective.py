@@ -5,12 +5,67 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from intabs.evaluate.metrics import Scaling
+from intabs.model import kinematics
+from intabs.model.space import State
 
-def action_error(predicted: Tensor, target: Tensor) -> Tensor:
-    """-log N(a; mu, sigma^2 I) up to scale and constant, mean over ticks and dimensions. (B, T, n) -> ()."""
-    return ((predicted - target) ** 2).mean()
+
+def action_error(predicted: Tensor, target: Tensor, mask: Tensor) -> Tensor:
+    """-log N(a; mu, sigma^2 I) up to scale and constant: mean over ticks and dimensions. (M, L, n), mask (M, L)."""
+    return (((predicted - target) ** 2).mean(-1) * mask).sum() / mask.sum()
 
 
 def kl_to_standard_normal(mean: Tensor, log_std: Tensor) -> Tensor:
-    """KL(N(mean, std^2) || N(0, I)) summed over z, mean over segments [nat] (Kingma & Welling 2014, appendix B)."""
+    """KL(N(mean, std^2) || N(0, I)) summed over z, mean over skills [nat] (Kingma & Welling 2014, appendix B)."""
     return (0.5 * (mean**2 + torch.exp(2 * log_std) - 1) - log_std).sum(-1).mean()
+
+
+def kl_between(mean: Tensor, log_std: Tensor, prior_mean: Tensor, prior_log_std: Tensor) -> Tensor:
+    """KL(N(mean, std^2) || N(prior_mean, prior_std^2)) of diagonal Gaussians, (..., n) -> (...) [nat]."""
+    ratio = torch.exp(2 * (log_std - prior_log_std))
+    apart = ((mean - prior_mean) / torch.exp(prior_log_std)) ** 2
+    return (0.5 * (ratio + apart - 1) - (log_std - prior_log_std)).sum(-1)
+
+
+def termination_error(logit: Tensor, begins: Tensor, mask: Tensor) -> Tensor:
+    """-log Bernoulli(b) of eta, (B, N): mean over ticks."""
+    loss = torch.nn.functional.binary_cross_entropy_with_logits(logit, begins, reduction="none")
+    return (loss * mask).sum() / mask.sum()
+
+
+def held_error(logit: Tensor, change: Tensor, carried: Tensor, mask: Tensor) -> Tensor:
+    """-log Bernoulli of an object's being held, (M, L, S). The target is how much of the tip's motion the object's own
+    repeats: <change, carried> / |carried|^2 within 0 .. 1; ticks in which the tip hardly moves tell nothing."""
+    slots = logit.shape[-1]
+    change, carried = (x[..., : 6 * slots].unflatten(-1, (slots, 6)) for x in (change, carried))
+    square = (carried**2).sum(-1)
+    target = ((change * carried).sum(-1) / square.clamp(min=1e-6)).clamp(0, 1)
+    weight = mask[..., None] * (square > 0.05)
+    loss = torch.nn.functional.binary_cross_entropy_with_logits(logit, target, reduction="none")
+    return (loss * weight).sum() / weight.sum().clamp(min=1)
+
+
+class RolloutError(torch.nn.Module):
+    """How far a rollout stays from the demonstration, as `intabs evaluate` measures it (evaluate/metrics.py)."""
+
+    def __init__(self, scaling: Scaling):
+        super().__init__()
+        for name in ("agent", "p", "environment"):
+            spread = torch.as_tensor(getattr(scaling, name), dtype=torch.float32)
+            self.register_buffer(name, torch.where(spread > 0, 1 / spread.clamp(min=1e-9), 0.0))
+
+    def forward(self, got: State, want: State, mask: Tensor) -> Tensor:
+        """States (B, N, ...), mask (B, N) -> (3,): joints, position, orientation; mean over ticks of the L2 norm over
+        the dimensions of each group, in ranges of the training split and half turns."""
+        seen = want.valid[..., None]
+        position = torch.cat(
+            [
+                ((got.p - want.p) * self.p * seen).flatten(-2),
+                (got.environment - want.environment) * self.environment,
+            ],
+            -1,
+        )
+        angle = kinematics.angle_between(got.R, want.R) / torch.pi * want.valid
+        groups = ((got.agent - want.agent) * self.agent, position, angle)
+        norms = [torch.sqrt((e**2).sum(-1) + 1e-8) if e.shape[-1] else mask * 0 for e in groups]
+        return torch.stack([(n * mask).sum() / mask.sum() for n in norms])

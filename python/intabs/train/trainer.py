@@ -1,4 +1,4 @@
-"""Trains InteractionAbstractions by segment pretraining. Deterministic for a seed; resumes to the same weights."""
+"""Trains InteractionAbstractions. Deterministic for a seed; resumes to the same weights."""
 
 from __future__ import annotations
 
@@ -14,16 +14,27 @@ import torch
 import yaml
 
 from intabs import __version__, _core
-from intabs.data.demos import load_demos
-from intabs.data.features import Normalizer, trajectory
+from intabs.data.demos import Demo, load_demos
 from intabs.errors import UserError
-from intabs.model.networks import InteractionAbstractions
-from intabs.train.objective import action_error, kl_to_standard_normal
-from intabs.train.segments import Segments, SegmentSampler
+from intabs.evaluate.metrics import Scaling, motion_of
+from intabs.model.networks import InteractionAbstractions, encoder_inputs, phase, phase_basis
+from intabs.model.space import Space, state_of
+from intabs.train.boundaries import Boundaries
+from intabs.train.linear import start_linear
+from intabs.train.objective import (
+    RolloutError,
+    action_error,
+    held_error,
+    kl_between,
+    kl_to_standard_normal,
+    termination_error,
+)
+from intabs.train.windows import Demonstration, Windows, WindowSampler, disturbed
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 CHECKPOINT_EVERY = 500
 VALIDATE_EVERY = 250
+CHOICE = 0.02  # of eta's loss for the next skill [nat] beside that for the end of the running one [nat a tick]
 
 
 def load_config(name_or_file: str, overrides: list[str]) -> dict:
@@ -33,7 +44,16 @@ def load_config(name_or_file: str, overrides: list[str]) -> dict:
     if not path.exists():
         known = ", ".join(sorted(p.stem for p in CONFIGS.glob("*.yaml")))
         raise UserError(f"no config {name_or_file!r}; known: {known}, or the path of a .yaml file")
-    config = yaml.safe_load(path.read_text())
+    try:
+        config = yaml.safe_load(path.read_text())
+    except yaml.YAMLError as e:
+        raise UserError(f"{path}: not YAML: {' '.join(str(e).split())}") from None
+    if not isinstance(config, dict):
+        raise UserError(f"{path}: no settings in it; start from one of {CONFIGS.name}/*.yaml")
+    if "base" in config:  # another one with changes
+        config = _merged(load_config(config.pop("base"), []), config, path)
+    elif missing := {"model", "objective", "noise", "train"} - set(config):
+        raise UserError(f"{path}: has no {min(missing)}; start from one of {CONFIGS.name}/*.yaml")
     for item in overrides:
         key, sep, value = item.partition("=")
         node = config
@@ -54,12 +74,32 @@ def load_config(name_or_file: str, overrides: list[str]) -> dict:
     return config
 
 
+def _merged(base: dict, changes: dict, path: Path) -> dict:
+    for key, value in changes.items():
+        if key not in base:
+            raise UserError(f"{path}: no such setting: {key}")
+        base[key] = _merged(base[key], value, path) if isinstance(base[key], dict) else value
+    return base
+
+
 def file_hash(path: Path | str) -> str:
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
-def default_arm():
-    return _core.ArmModel.lite6()
+def load_space(demos: list[Demo]) -> Space:
+    """Sizes as in these demonstrations; scales not yet fitted."""
+    state, command = state_of(demos[0])
+    arm = _core.ArmModel.lite6() if command is not None else None
+    return Space(state.agent.shape[-1], state.p.shape[-2], state.environment.shape[-1], arm)
+
+
+def prepare(demos: list[Demo], space: Space) -> list[Demonstration]:
+    scale = space.command_scale.cpu()
+    out = []
+    for demo in demos:
+        state, command = state_of(demo)
+        out.append(Demonstration(state, torch.from_numpy(command) / scale if command is not None else None))
+    return out
 
 
 class Trainer:
@@ -67,21 +107,27 @@ class Trainer:
         self.config, self.data, self.run, self.seed, self.device = config, Path(data), Path(run), seed, device
         torch.manual_seed(seed)
         torch.use_deterministic_algorithms(True, warn_only=device != "cpu")
-        arm = default_arm()
         train_demos, self.data_attrs = load_demos(data, "train")
         valid_demos, _ = load_demos(data, "valid")
-        train = [trajectory(d, arm) for d in train_demos]
-        valid = [trajectory(d, arm) for d in valid_demos]
-        self.normalizer = Normalizer.fit(train)
-        length = tuple(config["objective"]["segment"])
+        space = load_space(train_demos)
+        space.fit([state_of(d) for d in train_demos])
+        self.demonstrations = prepare(train_demos, space)
+        self.scaling = Scaling.fit([motion_of(d.state) for d in self.demonstrations])
+        o = config["objective"]
+        augment = o["augment"]["lite6" if space.arm is not None else "other"]
 
-        def sampler(trajectories):
-            normalized = [self.normalizer.normalize(t) for t in trajectories]
-            return SegmentSampler(normalized, self.normalizer, arm, length, config["noise"], device)
-
-        self.sampler = sampler(train)
-        self.valid = sampler(valid) if valid else None
-        self.model = InteractionAbstractions(config["model"]).to(device)
+        self.sampler = WindowSampler(self.demonstrations, space, o["window"], tuple(o["segment"]), augment)
+        self.boundaries = Boundaries(space, [d.state for d in self.demonstrations], o["boundaries"])
+        cuts = [self.boundaries.cuts(d.state) for d in self.demonstrations]
+        self.joint_sampler = WindowSampler(self.demonstrations, space, o["window"], tuple(o["segment"]), augment, cuts)
+        self.valid = (
+            WindowSampler(prepare(valid_demos, space), space, o["window"], tuple(o["segment"])) if valid_demos else None
+        )
+        self.model = InteractionAbstractions(config["model"], space)
+        self.rollout_error = RolloutError(self.scaling)
+        start_linear(self.model, self.sampler, self.rollout_error, o["rollout"], seed)
+        self.model.to(device)
+        self.rollout_error.to(device)
         t = config["train"]
         self.optimizer = torch.optim.AdamW(self.model.parameters(), lr=t["lr"], weight_decay=t["weight_decay"])
         self.scheduler = torch.optim.lr_scheduler.LambdaLR(self.optimizer, self._rate)
@@ -97,22 +143,76 @@ class Trainer:
         x = (step - t["warmup"]) / max(1, t["steps"] - t["warmup"])
         return 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * min(x, 1.0)))
 
-    def _loss(self, batch: Segments, rng: np.random.Generator | None) -> tuple[torch.Tensor, dict]:
-        """rng: of z's noise; None takes the mean."""
-        mean, log_std = self.model.encode(batch.state, batch.agent_action, batch.environment_action)
+    def _loss(self, batch: Windows, rng: np.random.Generator | None, joint: bool = False) -> tuple[torch.Tensor, dict]:
+        """rng: of z's noise and of the disturbances pi sees; None: z at its mean, no disturbance. joint: with eta."""
+        o, model = self.config["objective"], self.model
+        space = model.space
+        now, after = batch.state[:, :-1], batch.state[:, 1:]
+        state, tip = space.features(now)
+        response, change = space.between(now, after)
+        command = batch.command if batch.command is not None else response
+        mean, log_std = model.encode(
+            *(batch.pieces(x) for x in encoder_inputs(space, state, batch.command, response, change)), batch.within
+        )
         z = mean
         if rng is not None:
             noise = rng.standard_normal(tuple(mean.shape), dtype="f4")
             z = mean + torch.exp(log_std) * torch.from_numpy(noise).to(mean.device)
-        agent, environment = self.model.act(batch.seen, z)
-        terms = {
-            "agent": action_error(agent, batch.agent_action),
-            "environment": action_error(environment, batch.environment_action),
-            "kl": kl_to_standard_normal(mean, log_std),
-        }
-        o = self.config["objective"]
-        loss = terms["agent"] + o["environment"] * terms["environment"] + o["beta"] * terms["kl"]
+        terms = {"kl": kl_to_standard_normal(mean, log_std)}
+
+        # pi on the recorded states, with the errors that a servo and cameras have.
+        if rng is not None and space.arm is not None:
+            state, _ = space.features(disturbed(now, self.config["noise"], rng))
+        seen = batch.pieces(state)
+        age = torch.arange(seen.shape[1], device=seen.device, dtype=seen.dtype)[None]
+        basis = phase_basis(phase(age, batch.within.sum(1, keepdim=True)))
+        y = model.pi(model.policy_input(seen, z[:, None].expand(-1, seen.shape[1], -1), basis))
+        terms["agent"] = action_error(y["agent"], batch.pieces(command), batch.within)
+        carried = space.carried(now, tip, after.agent[..., : space.joints])
+        if carried is not None:
+            carried = batch.pieces(carried)
+            terms["held"] = held_error(y["carried"], batch.pieces(change), carried, batch.within)
+        predicted = model.change(y, carried)
+        terms["environment"] = action_error(predicted, batch.pieces(change), batch.within)
+        if "response" in y:
+            terms["response"] = action_error(y["response"], batch.pieces(response), batch.within)
+
+        # pi on its own predictions.
+        rolled, _ = model.rollout(now[:, 0], z[batch.skill], batch.age, batch.ticks, hard=rng is None)
+        groups = self.rollout_error(rolled, after, batch.mask)
+        terms.update(zip(("joints", "position", "orientation"), groups, strict=True))
+        if joint:
+            terms.update(self._eta_terms(batch, state, z, mean, log_std))
+        loss = (
+            terms["agent"]
+            + o["motion"] * (terms["environment"] + terms.get("response", 0.0) + terms.get("held", 0.0))
+            + sum(w * g for w, g in zip(o["rollout"], groups, strict=True))
+            + o["beta"] * (terms["kl"] + terms.get("kl_eta", 0.0))
+            + o["eta"] * (terms.get("termination", 0.0) + CHOICE * terms.get("choice", 0.0))
+        )
         return loss, {k: v.detach() for k, v in terms.items()}
+
+    def _eta_terms(self, batch: Windows, state: torch.Tensor, z, mean, log_std) -> dict:
+        """eta runs beside each skill from zero memory, up to the tick in which the next begins."""
+        steps = state.shape[1]
+        length = batch.within.sum(1).long()
+        offset = torch.arange(batch.gather.shape[1] + 1, device=state.device)[None]
+        at = batch.gather[:, :1] + torch.minimum(offset, length[:, None])
+        row_end = (batch.gather[:, :1] // steps + 1) * steps - 1
+        seen = state.flatten(0, 1)[torch.minimum(at, row_end)]
+        mask = ((offset < length[:, None]) | ((offset == length[:, None]) & (batch.whole[:, None] > 0))).float()
+        mask[:, 0] = 0  # a skill lasts one tick at least
+        y = self.model.terminate(seen, z.detach(), offset.expand(len(z), -1).to(seen.dtype))
+        begins = (offset == length[:, None]).float()
+        terms = {"termination": termination_error(y["b"][..., 0], begins, mask)}
+        # What eta would have chosen next, at the tick where it does; skills of a window are neighbours in order.
+        first = torch.nonzero(batch.whole)[:, 0]
+        chosen = {k: y[k][first, length[first]] for k in ("mean", "log_std")}
+        prior = (chosen["mean"], chosen["log_std"].clamp(-4, 2))
+        q = (mean[first + 1], log_std[first + 1])
+        terms["choice"] = kl_between(*(x.detach() for x in q), *prior).mean()  # trains eta
+        terms["kl_eta"] = kl_between(*q, *(x.detach() for x in prior)).mean()  # trains the encoders
+        return terms
 
     def validate(self) -> dict:
         """Held-out demonstrations, always the same segments, z at its mean, no noise."""
@@ -123,7 +223,7 @@ class Trainer:
         sums: dict[str, float] = {}
         with torch.no_grad():
             for _ in range(4):
-                _, terms = self._loss(self.valid.sample(256, rng, noisy=False), None)
+                _, terms = self._loss(self.valid.sample(64, rng).to(self.device), None)
                 for k, v in terms.items():
                     sums[k] = sums.get(k, 0.0) + float(v) / 4
         self.model.train()
@@ -131,8 +231,11 @@ class Trainer:
 
     def one_step(self) -> tuple[torch.Tensor, dict]:
         """One batch, one update."""
-        batch = self.sampler.sample(self.config["train"]["batch"], self.rng)
-        loss, terms = self._loss(batch, self.rng)
+        # First skills of all lengths from anywhere; then half of the time those of the learned boundaries, with eta.
+        t = self.config["train"]
+        joint = self.step >= self.config["objective"]["joint_from"] * t["steps"] and self.step % 2 == 0
+        sampler = self.joint_sampler if joint else self.sampler
+        loss, terms = self._loss(sampler.sample(t["batch"], self.rng).to(self.device), self.rng, joint)
         if not torch.isfinite(loss):
             raise UserError(f"loss is not finite at step {self.step}; lower train.lr or look at the data")
         self.optimizer.zero_grad()
@@ -186,7 +289,7 @@ class Trainer:
         torch.save(
             {
                 "config": self.config,
-                "normalizer": self.normalizer.to_dict(),
+                "space": self.model.space.config,
                 "data": {"path": str(self.data), "sha256": file_hash(self.data)},
                 "code_version": __version__,
                 "seed": self.seed,
@@ -223,9 +326,9 @@ def load_checkpoint(run: Path | str) -> dict:
     return torch.load(path, map_location="cpu", weights_only=True)
 
 
-def load_model(run: Path | str) -> tuple[InteractionAbstractions, Normalizer, dict]:
+def load_model(run: Path | str) -> tuple[InteractionAbstractions, dict]:
     c = load_checkpoint(run)
-    model = InteractionAbstractions(c["config"]["model"])
+    model = InteractionAbstractions(c["config"]["model"], Space.from_config(c["space"], _core.ArmModel.lite6()))
     model.load_state_dict(c["model"])
     model.eval()
-    return model, Normalizer.from_dict(c["normalizer"]), c
+    return model, c

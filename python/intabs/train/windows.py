@@ -1,0 +1,214 @@
+"""Batches for training: windows of consecutive ticks, each cut into skills.
+
+A window is N ticks of one demonstration. Its cuts are drawn anew each time (segment pretraining) or are those learned.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from intabs.errors import UserError
+from intabs.model import kinematics
+from intabs.model.space import Space, State
+
+
+@dataclass
+class Demonstration:
+    state: State  # (T, ...)
+    command: Tensor | None  # (T - 1, A) a^r in units of its scale; None: the agent's displacement is the command
+
+
+@dataclass
+class Windows:
+    """B windows of N ticks, M skills of at most L ticks in them."""
+
+    state: State  # (B, N + 1, ...)
+    command: Tensor | None  # (B, N, A)
+    mask: Tensor  # (B, N) 1: a tick, 0: after the demonstration's end
+    skill: Tensor  # (B, N) long, which of the M skills runs
+    age: Tensor  # (B, N) ticks since it began
+    ticks: Tensor  # (B, N) how many it lasts
+    gather: Tensor  # (M, L) long, the skill's ticks among the B N
+    within: Tensor  # (M, L) 1: a tick of the skill, 0: after its end
+    whole: Tensor  # (M,) 1: its end lies in the window; 0: the window's last, which may go on
+
+    def pieces(self, x: Tensor) -> Tensor:
+        """(B, N, d) -> (M, L, d), by skill."""
+        return x.flatten(0, 1)[self.gather]
+
+    def to(self, device: str) -> Windows:
+        parts = {f.name: getattr(self, f.name) for f in fields(self)}
+        moved = {k: v.to(device) for k, v in parts.items() if isinstance(v, Tensor)}
+        return Windows(**{**parts, **moved, "state": self.state.map(lambda x: x.to(device))})
+
+
+class WindowSampler:
+    """Every tick of every demonstration is equally likely to begin a window.
+
+    ticks: N; segment: shortest and longest skill drawn; cuts: instead of drawing, for each demonstration the ticks at
+    which skills begin and, last, T - 1. augment: {"turn": rad} of the whole scene about the base (the Lite 6) or
+    {"mix", "scale", "shift", "turn"} of motions in W (any other agent): see `_augmented`.
+    """
+
+    def __init__(
+        self,
+        demonstrations: list[Demonstration],
+        space: Space,
+        ticks: int,
+        segment: tuple[int, int],
+        augment: dict | None = None,
+        cuts: list[np.ndarray] | None = None,
+    ):
+        for i, d in enumerate(demonstrations):
+            if len(d.state.agent) < 3:
+                raise UserError(f"demonstration {i} has {len(d.state.agent)} frames: 3 are the least")
+        self.demonstrations, self.space, self.cuts = demonstrations, space, cuts
+        self.ticks, self.segment, self.augment = ticks, segment, augment or {}
+        self.count = np.array([len(d.state.agent) - 1 for d in demonstrations])
+        self.first = np.concatenate([[0], np.cumsum(self.count + 1)])
+        self.state = State.join([d.state for d in demonstrations])
+        with_command = demonstrations[0].command is not None
+        # One row more a demonstration, so that states and commands share their index.
+        self.command = (
+            torch.cat([torch.cat([d.command, d.command[-1:]]) for d in demonstrations]) if with_command else None
+        )
+
+    def _pick(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+        """Demonstrations and first ticks. A window may run over the end, but holds a short skill at least."""
+        room = np.maximum(self.count - self.segment[0] + 1, 1)
+        at = rng.integers(room.sum(), size=n)
+        demo = np.searchsorted(np.cumsum(room), at, side="right")
+        start = at - (np.cumsum(room) - room)[demo]
+        if self.cuts is not None:  # from the beginning of a skill
+            for i, d in enumerate(demo):
+                begins = self.cuts[d][:-1]
+                start[i] = begins[np.searchsorted(begins, start[i], side="right") - 1]
+        return demo, start
+
+    def _cut(self, demo: int, start: int, ticks: int, low: int, high: int, rng: np.random.Generator) -> list[int]:
+        """Lengths of the skills of a window of `ticks` ticks: learned, or drawn from low .. high."""
+        if self.cuts is not None:
+            inside = self.cuts[demo] - start
+            inside = inside[(inside > 0) & (inside < ticks)]
+            return np.diff(np.concatenate([[0], inside, [ticks]])).tolist()
+        lengths: list[int] = []
+        while (left := ticks - sum(lengths)) > 0:
+            n = int(rng.integers(low, high + 1))
+            lengths.append(left if left - n < low else n)
+        return lengths
+
+    def sample(self, n: int, rng: np.random.Generator) -> Windows:
+        """`rng` is the whole source of chance."""
+        demo, start = self._pick(n, rng)
+        steps = self.ticks
+        # Short skills are as likely as long ones; those of a batch are of similar length, as padding costs time.
+        low, high = np.log(self.segment)
+        middle = np.exp(rng.uniform(low, high))
+        low, high = max(self.segment[0], int(0.85 * middle)), min(self.segment[1], int(1.15 * middle) + 1)
+        t = start[:, None] + np.arange(steps + 1)[None]
+        last = self.count[demo][:, None]
+        index = torch.from_numpy(self.first[demo][:, None] + np.minimum(t, last))
+        skill, age, ticks = (np.zeros((n, steps), "i8") for _ in range(3))
+        pieces: list[tuple[int, int]] = []
+        for b in range(n):
+            within = min(steps, int(last[b, 0] - start[b]))
+            at = 0
+            for length in self._cut(int(demo[b]), int(start[b]), within, low, high, rng):
+                skill[b, at : at + length] = len(pieces)
+                age[b, at : at + length] = np.arange(length)
+                ticks[b, at : at + length] = length
+                pieces.append((b * steps + at, length))
+                at += length
+            skill[b, at:], age[b, at:], ticks[b, at:] = len(pieces) - 1, np.arange(steps - at) + 1, 1
+        begin, length = np.array(pieces).T
+        offset = np.arange(length.max())[None]
+        state = self.state[index]
+        if self.augment:
+            other = self.state[torch.from_numpy(self._others(demo, t, rng))] if "mix" in self.augment else None
+            state = augmented(state, other, self.augment, self.space, rng)
+        return Windows(
+            state,
+            self.command[index[:, :-1]] if self.command is not None else None,
+            torch.from_numpy((t[:, 1:] <= last).astype("f4")),
+            torch.from_numpy(skill),
+            torch.from_numpy(age.astype("f4")),
+            torch.from_numpy(ticks.astype("f4")),
+            torch.from_numpy(begin[:, None] + np.minimum(offset, length[:, None] - 1)),
+            torch.from_numpy((offset < length[:, None]).astype("f4")),
+            torch.from_numpy(np.append(begin[1:] // steps == begin[:-1] // steps, False).astype("f4")),
+        )
+
+    def _others(self, demo: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Windows to mix in, from anywhere."""
+        other = rng.integers(len(self.demonstrations), size=len(demo))
+        room = np.maximum(self.count[other] - self.ticks, 0)
+        start = (rng.random(len(demo)) * (room + 1)).astype(int)
+        at = np.minimum(start[:, None] + np.arange(t.shape[1])[None], self.count[other][:, None])
+        return self.first[other][:, None] + at
+
+
+def augmented(s: State, other: State | None, how: dict, space: Space, rng: np.random.Generator) -> State:
+    """Motions that might have been recorded as well. s: (B, N + 1, ...).
+
+    The Lite 6: the scene turned about the base's z axis by N(0, turn): exact, as joint 1 turns about it.
+    Others: displacement from the window's first state scaled by `scale` (a range) and mixed with `mix` times that of
+    another window (half of the time); the whole shifted by `shift` of its deviation, objects turned by N(0, turn).
+    """
+    n = len(s.agent)
+
+    def normal(*shape):
+        return torch.from_numpy(rng.normal(size=shape).astype("f4"))
+
+    if space.arm is not None:
+        angle = how["turn"] * normal(n, 1)
+        zero = torch.zeros_like(angle)
+        Rz = kinematics.exp_so3(torch.stack([zero, zero, angle], -1))
+        agent = torch.cat([s.agent[..., :1] + angle[..., None], s.agent[..., 1:]], -1)
+        p = (Rz[:, :, None] @ s.p[..., None])[..., 0]
+        return State(agent, p, Rz[:, :, None] @ s.R, s.environment, s.known, s.valid)
+
+    low, high = how["scale"]
+    scale = torch.from_numpy(rng.uniform(low, high, (n, 1, 1)).astype("f4"))
+    half = torch.from_numpy((rng.random((n, 1, 1)) < 0.5).astype("f4"))
+    mix = torch.from_numpy(rng.uniform(-how["mix"], how["mix"], (n, 1, 1)).astype("f4")) * half
+
+    def moved(x: Tensor, y: Tensor, deviation: Tensor) -> Tensor:
+        more = (1,) * (x.dim() - 3)
+        shift = how["shift"] * deviation * normal(n, 1, *x.shape[2:])
+        a, b = scale.reshape(*scale.shape, *more), mix.reshape(*mix.shape, *more)
+        return x[:, :1] + a * (x - x[:, :1]) + b * (y - y[:, :1]) + shift
+
+    a, e = space.scale[: space.agent], space.scale[space.state_dim - space.environment :]
+    width = (space.environment_dim - space.environment) // space.slots if space.slots else 0
+    spread = torch.stack([space.scale[space.agent + width * i :][:3] for i in range(space.slots)]) if width else a[:0]
+    turn = s.R @ s.R[:, :1].transpose(-1, -2), other.R @ other.R[:, :1].transpose(-1, -2)
+    w, v = (torch.from_numpy(kinematics.log_so3(x.numpy().astype("f8")).astype("f4")) for x in turn)
+    first = kinematics.exp_so3(how["turn"] * normal(n, 1, space.slots, 3)) @ s.R[:, :1]
+    R = kinematics.exp_so3(scale[..., None] * w + mix[..., None] * v) @ first
+    return State(
+        moved(s.agent, other.agent, a),
+        moved(s.p, other.p, spread),
+        R,
+        moved(s.environment, other.environment, e),
+        s.known,
+        s.valid,
+    )
+
+
+def disturbed(s: State, noise: dict, rng: np.random.Generator) -> State:
+    """As a servo and cameras with errors would give it. Standard deviations: {"object_mm", "object_deg"} one error an
+    object and window, {"tick_mm", "joint_mrad"} one a tick. s (B, N, ...) of the Lite 6."""
+    n, t, slots, _ = s.p.shape
+
+    def normal(scale, *shape):
+        return scale * torch.from_numpy(rng.normal(size=shape).astype("f4")).to(s.p)
+
+    joints = s.agent.shape[-1] - 1
+    q = s.agent[..., :-1] + normal(1e-3 * noise["joint_mrad"], n, t, joints)
+    p = s.p + normal(1e-3 * noise["object_mm"], n, 1, slots, 3) + normal(1e-3 * noise["tick_mm"], n, t, slots, 3)
+    R = kinematics.exp_so3(normal(np.radians(noise["object_deg"]), n, 1, slots, 3)) @ s.R
+    return State(torch.cat([q, s.agent[..., -1:]], -1), p, R, s.environment, s.known, s.valid)
