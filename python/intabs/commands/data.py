@@ -155,13 +155,14 @@ def register(app: typer.Typer) -> None:
         valid: Annotated[float, typer.Option(min=0, max=1, help="Share to hold out, of every task.")] = 0.1,
         seed: Annotated[int, typer.Option(min=0)] = 0,
         apart: Annotated[bool, typer.Option("--apart", help="Two files, OUT_train and OUT_valid, instead.")] = False,
+        by: Annotated[str, typer.Option(help="Attribute whose values are held out whole, e.g. object_names.")] = "",
         json: JsonOption = None,
     ) -> None:
         """Hold out demonstrations anew (masks train and valid)."""
         from intabs.data import edit as edits
 
         with Progress("split", total=1) as bar:
-            figures = edits.split(file, out or file, valid, seed, apart, _counting(bar))
+            figures = edits.split(file, out or file, valid, seed, apart, by, _counting(bar))
         write_json(json, figures)
         print(", ".join(f"{mask}: {n}" for mask, n in figures.items()))
 

@@ -23,6 +23,9 @@ def register(app: typer.Typer) -> None:
         config: Annotated[str, typer.Option(help="intabs, intabs-small, or a YAML file of that form.")],
         data: Annotated[Path, typer.Option(help="Demonstrations, HDF5.")],
         out: Annotated[Path, typer.Option(help="Folder of the run: checkpoint, TensorBoard curves, result.json.")],
+        replays: Annotated[
+            Path | None, typer.Option(help="More of the same, by `intabs replay`: objects elsewhere (the Lite 6).")
+        ] = None,
         set_: Annotated[
             list[str] | None, typer.Option("--set", help="Change a setting, e.g. train.steps=2000. Repeatable.")
         ] = None,
@@ -31,7 +34,7 @@ def register(app: typer.Typer) -> None:
         seed: Annotated[int, typer.Option(help="Of initial weights, batches and noise.", min=0)] = 0,
         json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
     ) -> None:
-        """Train encoders and policy by segment pretraining; held-out demonstrations are scored on the way."""
+        """Train encoders, policy and high-level policy; held-out demonstrations are scored on the way."""
         try:
             import torch
         except ImportError:
@@ -40,7 +43,7 @@ def register(app: typer.Typer) -> None:
 
         if device is Device.cuda and not torch.cuda.is_available():
             raise UserError("--device cuda: torch sees no GPU here; leave it out")
-        trainer = Trainer(load_config(config, set_ or []), data, out, seed, device.value)
+        trainer = Trainer(load_config(config, set_ or []), data, out, seed, device.value, replays)
         if resume:
             trainer.resume()
         elif trainer.path.exists():

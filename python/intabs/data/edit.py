@@ -190,10 +190,33 @@ def hold_out(names: list[str], tasks: list[str], share: float, seed: int) -> dic
     }
 
 
-def split(path: Path, out: Path, share: float, seed: int, apart: bool, progress: Progress = _quiet) -> dict:
-    """Masks anew. apart: two files, <out>_train and <out>_valid, instead."""
+def hold_out_groups(names: list[str], groups: list[str], share: float, seed: int) -> dict[str, list[str]]:
+    """Masks train and valid: whole groups by chance, until `share` of the demonstrations are held out."""
+    order = np.random.default_rng(seed).permutation(sorted(set(groups)))
+    held: set[str] = set()
+    for group in order[:-1]:  # one stays
+        if sum(g in held for g in groups) >= round(share * len(names)):
+            break
+        held.add(str(group))
+    return {
+        "train": [n for n, g in zip(names, groups, strict=True) if g not in held],
+        "valid": [n for n, g in zip(names, groups, strict=True) if g in held],
+    }
+
+
+def split(
+    path: Path, out: Path, share: float, seed: int, apart: bool, by: str = "", progress: Progress = _quiet
+) -> dict:
+    """Masks anew. apart: two files, <out>_train and <out>_valid, instead. by: an attribute of the demonstrations; those
+    that share its value are held out together."""
     with DemoFile(path) as f:
-        masks = hold_out(f.names, f.tasks, share, seed)
+        if by:
+            attrs = [f.demo_attrs(k) for k in range(len(f))]
+            if missing := [n for n, a in zip(f.names, attrs, strict=True) if by not in a]:
+                raise UserError(f"{path}: {missing[0]} has no attribute {by!r} (--by); it has {', '.join(attrs[0])}")
+            masks = hold_out_groups(f.names, [str(a[by]) for a in attrs], share, seed)
+        else:
+            masks = hold_out(f.names, f.tasks, share, seed)
         if not apart:
             others = {m: n for m, n in f.masks().items() if m not in masks}
             _rewrite(f, out, range(len(f)), {}, others | masks, progress)

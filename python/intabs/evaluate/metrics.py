@@ -13,7 +13,8 @@ from intabs.data.demos import Demo
 from intabs.model.space import State, state_of
 
 GROUPS = ("joints", "position", "orientation")
-CONSTANT = 1e-4  # a dimension that varies by less over the training split is dropped
+CONSTANT = 1e-4  # a dimension that varies by less over the training split is dropped;
+SEEN_CONSTANT = 2e-3  # m; of an object's position, as perceived poses of what rests vary by so much
 
 
 @dataclass
@@ -55,14 +56,14 @@ class Scaling:
     def fit(motions: list[Motion]) -> Scaling:
         every = joined(motions)
 
-        def spread(x: np.ndarray) -> np.ndarray:
+        def spread(x: np.ndarray, constant: float = CONSTANT) -> np.ndarray:
             if not len(x):
                 return np.zeros(x.shape[1:])
             r = np.ptp(x, axis=0)
-            return np.where(r > CONSTANT, r, 0.0)
+            return np.where(r > constant, r, 0.0)
 
         slots = every.p.shape[1]
-        p = [spread(every.p[every.valid[:, i], i]) for i in range(slots)]
+        p = [spread(every.p[every.valid[:, i], i], SEEN_CONSTANT) for i in range(slots)]
         return Scaling(
             spread(every.agent),
             np.stack(p) if slots else np.zeros((0, 3)),

@@ -14,7 +14,8 @@ import torch
 import yaml
 
 from intabs import __version__, _core
-from intabs.data.demos import Demo, load_demos
+from intabs.data.demos import Demo
+from intabs.data.reader import DemoFile
 from intabs.errors import UserError
 from intabs.evaluate.metrics import Scaling, motion_of
 from intabs.model.networks import InteractionAbstractions, encoder_inputs, phase, phase_basis
@@ -93,36 +94,51 @@ def load_space(demos: list[Demo]) -> Space:
     return Space(state.agent.shape[-1], state.p.shape[-2], state.environment.shape[-1], arm)
 
 
-def prepare(demos: list[Demo], space: Space) -> list[Demonstration]:
+def load_named(path: Path | str, mask: str | None = None) -> tuple[list[Demo], list[str]]:
+    with DemoFile(path, mask) as f:
+        return [f.demo(k) for k in range(len(f))], list(f.names)
+
+
+def prepare(demos: list[Demo], space: Space, names: list[str] | None = None) -> list[Demonstration]:
     scale = space.command_scale.cpu()
     out = []
-    for demo in demos:
+    for i, demo in enumerate(demos):
         state, command = state_of(demo)
-        out.append(Demonstration(state, torch.from_numpy(command) / scale if command is not None else None))
+        scaled = torch.from_numpy(command) / scale if command is not None else None
+        out.append(Demonstration(state, scaled, names[i] if names else ""))
     return out
 
 
 class Trainer:
-    def __init__(self, config: dict, data: Path | str, run: Path | str, seed: int, device: str):
+    """replays: a file of `intabs replay`; those of held-out demonstrations are left out."""
+
+    def __init__(
+        self, config: dict, data: Path | str, run: Path | str, seed: int, device: str, replays: Path | str | None = None
+    ):
         self.config, self.data, self.run, self.seed, self.device = config, Path(data), Path(run), seed, device
+        self.replays = Path(replays) if replays else None
         torch.manual_seed(seed)
         torch.use_deterministic_algorithms(True, warn_only=device != "cpu")
-        train_demos, self.data_attrs = load_demos(data, "train")
-        valid_demos, _ = load_demos(data, "valid")
+        train_demos, train_names = load_named(data, "train")
+        valid_demos, _ = load_named(data, "valid")
+        replayed = load_named(self.replays)[0] if self.replays else []
+        replayed = [d for d in replayed if d.attrs.get("source") in train_names]
+        if self.replays and not replayed:
+            raise UserError(f"{replays}: holds no replays of the demonstrations that {data} trains on")
         space = load_space(train_demos)
-        space.fit([state_of(d) for d in train_demos])
-        self.demonstrations = prepare(train_demos, space)
-        self.scaling = Scaling.fit([motion_of(d.state) for d in self.demonstrations])
+        space.fit([state_of(d) for d in train_demos + replayed])
+        recorded = prepare(train_demos, space, train_names)
+        self.scaling = Scaling.fit([motion_of(d.state) for d in recorded])
         o = config["objective"]
         augment = o["augment"]["lite6" if space.arm is not None else "other"]
-
-        self.sampler = WindowSampler(self.demonstrations, space, o["window"], tuple(o["segment"]), augment)
-        self.boundaries = Boundaries(space, [d.state for d in self.demonstrations], o["boundaries"])
-        cuts = [self.boundaries.cuts(d.state) for d in self.demonstrations]
-        self.joint_sampler = WindowSampler(self.demonstrations, space, o["window"], tuple(o["segment"]), augment, cuts)
-        self.valid = (
-            WindowSampler(prepare(valid_demos, space), space, o["window"], tuple(o["segment"])) if valid_demos else None
-        )
+        self.boundaries = Boundaries(space, [d.state for d in recorded], o["boundaries"])
+        cuts = {d.source: self.boundaries.cuts(d.state) for d in recorded}  # a replay has those of its recording
+        train = recorded + prepare(replayed, space, [str(d.attrs["source"]) for d in replayed])
+        window, segment = o["window"], tuple(o["segment"])
+        self.sampler = WindowSampler(train, space, window, segment, augment)
+        self.joint_sampler = WindowSampler(train, space, window, segment, augment, [cuts[d.source] for d in train])
+        valid = prepare(valid_demos, space)
+        self.valid = WindowSampler(valid, space, window, segment) if valid else None
         self.model = InteractionAbstractions(config["model"], space)
         self.rollout_error = RolloutError(self.scaling)
         start_linear(self.model, self.sampler, self.rollout_error, o["rollout"], seed)
@@ -149,33 +165,20 @@ class Trainer:
         space = model.space
         now, after = batch.state[:, :-1], batch.state[:, 1:]
         state, tip = space.features(now)
-        response, change = space.between(now, after)
-        command = batch.command if batch.command is not None else response
-        mean, log_std = model.encode(
-            *(batch.pieces(x) for x in encoder_inputs(space, state, batch.command, response, change)), batch.within
-        )
+        change = space.between(now, after)
+        shown = (space.features(batch.shown[:, :-1])[0], *space.between(batch.shown[:, :-1], batch.shown[:, 1:]))
+        inputs = encoder_inputs(space, shown[0], batch.shown_command, *shown[1:])
+        mean, log_std = model.encode(*(batch.pieces(x) for x in inputs), batch.within)
         z = mean
         if rng is not None:
             noise = rng.standard_normal(tuple(mean.shape), dtype="f4")
             z = mean + torch.exp(log_std) * torch.from_numpy(noise).to(mean.device)
         terms = {"kl": kl_to_standard_normal(mean, log_std)}
-
-        # pi on the recorded states, with the errors that a servo and cameras have.
-        if rng is not None and space.arm is not None:
-            state, _ = space.features(disturbed(now, self.config["noise"], rng))
-        seen = batch.pieces(state)
-        age = torch.arange(seen.shape[1], device=seen.device, dtype=seen.dtype)[None]
-        basis = phase_basis(phase(age, batch.within.sum(1, keepdim=True)))
-        y = model.pi(model.policy_input(seen, z[:, None].expand(-1, seen.shape[1], -1), basis))
-        terms["agent"] = action_error(y["agent"], batch.pieces(command), batch.within)
-        carried = space.carried(now, tip, after.agent[..., : space.joints])
-        if carried is not None:
-            carried = batch.pieces(carried)
-            terms["held"] = held_error(y["carried"], batch.pieces(change), carried, batch.within)
-        predicted = model.change(y, carried)
-        terms["environment"] = action_error(predicted, batch.pieces(change), batch.within)
-        if "response" in y:
-            terms["response"] = action_error(y["response"], batch.pieces(response), batch.within)
+        if space.arm is not None:
+            if rng is not None:  # what a servo with errors and cameras with errors would say
+                state, _ = space.features(disturbed(now, self.config["noise"], rng))
+            carried = space.carried(now, tip, after.agent[..., : space.joints])
+            terms.update(self._on_recorded_states(batch, state, z, *change, carried))
 
         # pi on its own predictions.
         rolled, _ = model.rollout(now[:, 0], z[batch.skill], batch.age, batch.ticks, hard=rng is None)
@@ -184,13 +187,26 @@ class Trainer:
         if joint:
             terms.update(self._eta_terms(batch, state, z, mean, log_std))
         loss = (
-            terms["agent"]
-            + o["motion"] * (terms["environment"] + terms.get("response", 0.0) + terms.get("held", 0.0))
+            terms.get("agent", 0.0)
+            + o["motion"] * sum(terms.get(k, 0.0) for k in ("environment", "response", "held"))
             + sum(w * g for w, g in zip(o["rollout"], groups, strict=True))
             + o["beta"] * (terms["kl"] + terms.get("kl_eta", 0.0))
             + o["eta"] * (terms.get("termination", 0.0) + CHOICE * terms.get("choice", 0.0))
         )
         return loss, {k: v.detach() for k, v in terms.items()}
+
+    def _on_recorded_states(self, batch: Windows, state: torch.Tensor, z, response, change, carried) -> dict:
+        """pi on the Lite 6's recorded states: its commands, which no kinematic rollout can tell, and all else."""
+        seen, carried, change = batch.pieces(state), batch.pieces(carried), batch.pieces(change)
+        age = torch.arange(seen.shape[1], device=seen.device, dtype=seen.dtype)[None]
+        basis = phase_basis(phase(age, batch.within.sum(1, keepdim=True)))
+        y = self.model.pi(self.model.policy_input(seen, z[:, None].expand(-1, seen.shape[1], -1), basis))
+        return {
+            "agent": action_error(y["agent"], batch.pieces(batch.command), batch.within),
+            "response": action_error(y["response"], batch.pieces(response), batch.within),
+            "environment": action_error(self.model.change(y, carried), change, batch.within),
+            "held": held_error(y["carried"], change, carried, batch.within),
+        }
 
     def _eta_terms(self, batch: Windows, state: torch.Tensor, z, mean, log_std) -> dict:
         """eta runs beside each skill from zero memory, up to the tick in which the next begins."""
@@ -290,7 +306,12 @@ class Trainer:
             {
                 "config": self.config,
                 "space": self.model.space.config,
-                "data": {"path": str(self.data), "sha256": file_hash(self.data)},
+                "data": {
+                    "path": str(self.data),
+                    "sha256": file_hash(self.data),
+                    "replays_sha256": file_hash(self.replays) if self.replays else "",
+                    "replays": sum(len(x) - 1 for x in {tuple(x) for x in self.sampler.same}),
+                },
                 "code_version": __version__,
                 "seed": self.seed,
                 "step": self.step,
@@ -312,6 +333,8 @@ class Trainer:
             raise UserError(f"{self.path}: was trained with another model configuration")
         if c["data"]["sha256"] != file_hash(self.data):
             raise UserError(f"{self.path}: was trained on other data ({c['data']['path']})")
+        if c["data"]["replays_sha256"] != (file_hash(self.replays) if self.replays else ""):
+            raise UserError(f"{self.path}: was trained with other --replays")
         self.model.load_state_dict(c["model"])
         self.optimizer.load_state_dict(c["optimizer"])
         self.scheduler.load_state_dict(c["scheduler"])

@@ -20,6 +20,7 @@ from intabs.model.space import Space, State
 class Demonstration:
     state: State  # (T, ...)
     command: Tensor | None  # (T - 1, A) a^r in units of its scale; None: the agent's displacement is the command
+    source: str = ""  # what it is a replay of, tick by tick; recordings have their own name
 
 
 @dataclass
@@ -28,6 +29,8 @@ class Windows:
 
     state: State  # (B, N + 1, ...)
     command: Tensor | None  # (B, N, A)
+    shown: State  # what the encoders see: `state`, or the same ticks of another replay of the same recording
+    shown_command: Tensor | None
     mask: Tensor  # (B, N) 1: a tick, 0: after the demonstration's end
     skill: Tensor  # (B, N) long, which of the M skills runs
     age: Tensor  # (B, N) ticks since it began
@@ -43,7 +46,8 @@ class Windows:
     def to(self, device: str) -> Windows:
         parts = {f.name: getattr(self, f.name) for f in fields(self)}
         moved = {k: v.to(device) for k, v in parts.items() if isinstance(v, Tensor)}
-        return Windows(**{**parts, **moved, "state": self.state.map(lambda x: x.to(device))})
+        states = {k: v.map(lambda x: x.to(device)) for k, v in parts.items() if isinstance(v, State)}
+        return Windows(**{**parts, **moved, **states})
 
 
 class WindowSampler:
@@ -51,7 +55,10 @@ class WindowSampler:
 
     ticks: N; segment: shortest and longest skill drawn; cuts: instead of drawing, for each demonstration the ticks at
     which skills begin and, last, T - 1. augment: {"turn": rad} of the whole scene about the base (the Lite 6) or
-    {"mix", "scale", "shift", "turn"} of motions in W (any other agent): see `_augmented`.
+    {"mix", "scale", "shift", "turn"} of motions in W (any other agent): see `augmented`.
+
+    Where there are replays of a recording, half of the windows show the encoders the same ticks of another one: a skill
+    is to be what they have in common, and pi to find from the state how it goes here.
     """
 
     def __init__(
@@ -72,6 +79,8 @@ class WindowSampler:
         self.first = np.concatenate([[0], np.cumsum(self.count + 1)])
         self.state = State.join([d.state for d in demonstrations])
         with_command = demonstrations[0].command is not None
+        names = np.array([d.source for d in demonstrations])
+        self.same = [np.flatnonzero(names == n) if n else np.array([i]) for i, n in enumerate(names)]
         # One row more a demonstration, so that states and commands share their index.
         self.command = (
             torch.cat([torch.cat([d.command, d.command[-1:]]) for d in demonstrations]) if with_command else None
@@ -126,13 +135,21 @@ class WindowSampler:
             skill[b, at:], age[b, at:], ticks[b, at:] = len(pieces) - 1, np.arange(steps - at) + 1, 1
         begin, length = np.array(pieces).T
         offset = np.arange(length.max())[None]
-        state = self.state[index]
+        shown = demo.copy()
+        for i, d in enumerate(demo):
+            if len(self.same[d]) > 1 and rng.random() < 0.5:
+                shown[i] = rng.choice(self.same[d])
+        shown_index = torch.from_numpy(self.first[shown][:, None] + np.minimum(t, last))
+        state, seen = self.state[index], self.state[shown_index]
         if self.augment:
             other = self.state[torch.from_numpy(self._others(demo, t, rng))] if "mix" in self.augment else None
-            state = augmented(state, other, self.augment, self.space, rng)
+            both = augmented(State.join([state, seen], cat=1), other, self.augment, self.space, rng)
+            state, seen = both[:, : steps + 1], both[:, steps + 1 :]
         return Windows(
             state,
             self.command[index[:, :-1]] if self.command is not None else None,
+            seen,
+            self.command[shown_index[:, :-1]] if self.command is not None else None,
             torch.from_numpy((t[:, 1:] <= last).astype("f4")),
             torch.from_numpy(skill),
             torch.from_numpy(age.astype("f4")),
@@ -175,6 +192,8 @@ def augmented(s: State, other: State | None, how: dict, space: Space, rng: np.ra
     scale = torch.from_numpy(rng.uniform(low, high, (n, 1, 1)).astype("f4"))
     half = torch.from_numpy((rng.random((n, 1, 1)) < 0.5).astype("f4"))
     mix = torch.from_numpy(rng.uniform(-how["mix"], how["mix"], (n, 1, 1)).astype("f4")) * half
+
+    other = State.join([other, other], cat=1) if other.agent.shape[1] < s.agent.shape[1] else other
 
     def moved(x: Tensor, y: Tensor, deviation: Tensor) -> Tensor:
         more = (1,) * (x.dim() - 3)

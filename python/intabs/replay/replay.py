@@ -1,0 +1,253 @@
+"""Perturbed replays of recorded demonstrations: the same motion, tick by tick, relative to objects that lie elsewhere,
+tried in the plant. From a recording alone: its commands and what was seen; nothing of the demonstrator's script.
+
+The tip's commanded path X(t) becomes D(t) X(t). D moves along with what the motion is about: not at all at the start,
+then with the object that will be moved (its displacement D_i), then, as it comes near another object, with that one's
+(D_j). Inverse kinematics gives the new commands. After Mandlekar et al., MimicGen (2023), with references that go over
+into each other instead of cut pieces.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+from scipy.spatial.transform import Rotation
+
+from intabs import _core, paths
+from intabs.data.demos import OBJECT_SLOTS, Demo, DemoWriter
+from intabs.jobs import in_processes
+
+NEAR_GRASP = 0.08  # m, tip from the place where the object begins to move: there D is D_i
+NEAR_GOAL = 0.10  # m, moved object from the other one: there D is D_j
+SMOOTH = 4.0  # ticks, of D's weights
+MOVED = 0.015  # m or
+TURNED = 0.15  # rad: an object that moved in a demonstration
+LEAD = 1.0  # ticks, of the command before the arm
+RETURN = 0.12  # of a disturbance, a tick, that the recorded commands take back
+MIN_SPREAD = 1.0  # cm
+REPLAY_SEEDS = 300000  # of the plant; evaluation uses others
+MAX_STEP = 0.08  # rad a tick (2 rad/s): a path that is faster is not tried
+
+
+@dataclass
+class Outline:
+    """What a demonstration's motion is about, tick by tick."""
+
+    q_target: np.ndarray  # (T, 6) commanded
+    gripper: np.ndarray  # (T,) bool commanded
+    mover: int  # slot of the object that is moved
+    other: int  # slot of what it is brought to; -1: nothing
+    to_mover: np.ndarray  # (T,) 0 .. 1
+    to_other: np.ndarray  # (T,) 0 .. 1
+
+
+def outline(demo: Demo, arm) -> Outline | None:
+    """None if nothing was moved."""
+    # The measured path, ahead by the servo's lag. Recorded actions leave out the demonstrator's disturbances, so that
+    # their sum is not where the arm was.
+    t = np.arange(len(demo))
+    target = np.stack([np.interp(t + LEAD, t, x) for x in demo.joint_pos.T], 1)
+    tip = np.array([arm.tip(q)[:3] for q in target])
+    p = demo.object_pose[..., :3]
+    seen = [i for i in range(p.shape[1]) if demo.object_valid[:, i].any()]
+    far, turned = np.zeros(p.shape[1]), np.zeros(p.shape[1])
+    for i in seen:
+        ok = demo.object_valid[:, i].astype(bool)
+        far[i] = np.linalg.norm(p[ok, i] - p[ok, i][0], axis=1).max()
+        R = Rotation.from_quat(np.roll(demo.object_pose[ok, i, 3:], -1, -1))
+        turned[i] = (R[0].inv() * R).magnitude().max()
+    moved = [i for i in seen if far[i] > MOVED or turned[i] > TURNED]
+    if not moved:
+        return None
+    mover = max(moved, key=lambda i: far[i] + 0.1 * turned[i])
+    ok = demo.object_valid[:, mover].astype(bool)
+    path = p[:, mover].copy()
+    for k in range(3):
+        path[:, k] = np.interp(np.arange(len(p)), np.flatnonzero(ok), path[ok, k])
+    R = Rotation.from_quat(np.roll(demo.object_pose[ok, mover, 3:], -1, -1))
+    angle = np.interp(np.arange(len(p)), np.flatnonzero(ok), (R[0].inv() * R).magnitude())
+    began = int(np.argmax((np.linalg.norm(path - path[0], axis=1) > 0.3 * MOVED) | (angle > 0.3 * TURNED)))
+    to_mover = _progress(np.linalg.norm(tip - tip[began], axis=1), NEAR_GRASP)
+    to_mover[began:] = 1
+    others = [j for j in seen if j != mover]
+    other, to_other = -1, np.zeros(len(p))
+    if others and far[mover] > 3 * MOVED:
+        distance = np.array([np.linalg.norm(path - p[:, j].mean(0), axis=1) for j in others])
+        k = int(np.argmin(distance[:, began:].min(1)))
+        other = others[k]
+        to_other = _progress(distance[k], NEAR_GOAL)
+        to_other[:began] = 0
+    return Outline(target, demo.actions[:, 6] > 0, mover, other, to_mover, to_other)
+
+
+def _progress(distance: np.ndarray, near: float) -> np.ndarray:
+    """0 at the first distance, 1 from `near` on; never back, smoothed."""
+    start = max(distance[0], near + 1e-3)
+    w = np.clip((start - distance) / (start - min(near, 0.8 * start)), 0, 1)
+    w = np.maximum.accumulate(w)
+    w = w * w * (3 - 2 * w)
+    return np.clip(gaussian_filter1d(w, SMOOTH), 0, 1)
+
+
+def displacement(old: np.ndarray, new: np.ndarray) -> tuple[np.ndarray, float]:
+    """Of an object's pose (7,) in the table's plane: where its place goes, p -> p_new + Rz(yaw)(p - p_old)."""
+    R = Rotation.from_quat(np.roll(new[3:], -1)) * Rotation.from_quat(np.roll(old[3:], -1)).inv()
+    return new[:3] - old[:3], float(R.as_rotvec()[2])
+
+
+class Replayer:
+    """Replays in one task's world. Not for several threads."""
+
+    def __init__(self, task: str):
+        self.session = _core.Session(str(paths.MODELS), task, "")
+        self.arm = _core.ArmModel.lite6()
+        self.ik = _core.IkSolver(self.arm)
+
+    def commands(self, demo: Demo, about: Outline, new: np.ndarray) -> np.ndarray | None:
+        """Joint targets (T, 6) for objects at `new` (S, 7); None if they cannot be reached smoothly."""
+        first = {
+            i: demo.object_pose[np.argmax(demo.object_valid[:, i]), i] for i in (about.mover, about.other) if i >= 0
+        }
+        moves = {i: displacement(first[i], new[i]) for i in first}
+        out, q = [], about.q_target[0]
+        for t, target in enumerate(about.q_target):
+            X = np.asarray(self.arm.tip(target))
+            p, R = X[:3], Rotation.from_quat(np.roll(X[3:], -1))
+            w, v = about.to_mover[t], about.to_other[t]
+            shift, yaw = np.zeros(3), 0.0
+            for i, weight in ((about.mover, w * (1 - v)), (about.other, v)):
+                if i < 0:
+                    continue
+                step, angle = moves[i]
+                turned = Rotation.from_rotvec([0, 0, angle]).apply(p - first[i][:3])
+                shift = shift + weight * (first[i][:3] + step + turned - p)
+                yaw += weight * angle
+            turn = Rotation.from_rotvec([0, 0, yaw]) * R
+            pose = np.concatenate([p + shift, np.roll(turn.as_quat(), 1)])
+            answer = self.ik.solve(pose, q)
+            if not answer.ok:
+                return None
+            if t and np.abs(answer.q - q).max() > MAX_STEP:
+                return None
+            q = np.asarray(answer.q)
+            out.append(q)
+        return np.stack(out)
+
+    def replay(self, demo: Demo, about: Outline, seed: int, spread_cm: float, disturb: float) -> Demo | str:
+        """One try with the objects where the plant puts them for this seed; the reason if it failed.
+
+        disturb: standard deviation [rad] of pushes the commands get now and then and take back (Laskey et al., DART,
+        2017); what is recorded as the action takes back, it does not push."""
+        session = self.session
+        session.reset(seed, spread_cm)
+        rng = np.random.default_rng(seed)
+        path = self.commands(demo, about, session.observe()["object_pose"])
+        if path is None:
+            return "out of reach"
+        rows, pushed, target = [], np.zeros(6), path[0].copy()
+        for t, wanted in enumerate(path):
+            o = session.observe()
+            before = target
+            pushed = pushed * (1 - RETURN)
+            meant = wanted + pushed
+            action = np.append(meant - before, 1.0 if about.gripper[t] else -1.0)
+            if disturb and rng.random() < 0.05:
+                pushed = pushed + disturb * rng.normal(size=6)
+            target = wanted + pushed
+            rows.append((o["utime"] * 1e-6, o["q"], o["dq"], o["gripper_closed"], o["object_pose"], o["object_valid"],
+                         action))  # fmt: skip
+            if session.command(target, bool(about.gripper[t])) != 0:
+                return "the driver refused"
+        for _ in range(15):
+            if session.command(target, bool(about.gripper[-1])) != 0:
+                break
+        if not session.success:
+            return session.failure_reason.split(" [")[0]
+        return Demo(*(np.array(x) for x in zip(*rows, strict=True)), {"seed": seed, "spread_cm": spread_cm})
+
+
+def pad_slots(demo: Demo) -> Demo:
+    missing = OBJECT_SLOTS - demo.object_pose.shape[1]
+    if missing:
+        demo.object_pose = np.pad(demo.object_pose, ((0, 0), (0, missing), (0, 0)))
+        demo.object_valid = np.pad(demo.object_valid, ((0, 0), (0, missing)))
+    return demo
+
+
+@dataclass
+class Try:
+    source: str  # name of the recorded demonstration
+    demo: Demo
+    seed: int
+    spread_cm: float
+    disturb: float
+
+
+_replayers: dict[str, Replayer] = {}
+
+
+def attempt(one: Try) -> tuple[Try, Demo | str]:
+    """In a worker process, which keeps its worlds."""
+    task = one.demo.attrs["task"]
+    if task not in _replayers:
+        _replayers[task] = Replayer(task)
+    about = outline(one.demo, _replayers[task].arm)
+    if about is None:
+        return one, "nothing is moved in the recording"
+    return one, _replayers[task].replay(one.demo, about, one.seed, one.spread_cm, one.disturb)
+
+
+def make(data: Path, out: Path, number: int, spread_cm: float, disturb: float, seed: int, jobs: int, progress) -> dict:
+    """Replays of the training split's demonstrations: `number` that succeeded, as many of each task as of others.
+    {demos, frames, tries, tasks: {task: {demos, tries, failures: {reason: n}}}}."""
+    from intabs.data.reader import DemoFile
+
+    with DemoFile(data, "train") as f:
+        recorded = [(f.names[k], pad_slots(f.demo(k))) for k in range(len(f))]
+        attrs = {k: f.attrs[k] for k in ("embodiment", "rate_hz", "env_args") if k in f.attrs}
+    by_task: dict[str, list] = {}
+    for name, demo in recorded:
+        by_task.setdefault(str(demo.attrs["task"]), []).append((name, demo))
+    wanted = {task: number // len(by_task) + (i < number % len(by_task)) for i, task in enumerate(sorted(by_task))}
+    figures = {task: {"demos": 0, "tries": 0, "failures": Counter()} for task in wanted}
+    frames = done = 0
+
+    def tries():
+        # A source that cannot be replayed must not keep this going for ever.
+        for task in sorted(by_task):
+            rng = np.random.default_rng([seed, len(task), *task.encode()])
+            for k in range(6 * wanted[task]):
+                if figures[task]["demos"] >= wanted[task]:
+                    break
+                name, demo = by_task[task][k % len(by_task[task])]
+                yield Try(name, demo, REPLAY_SEEDS + seed + k, float(rng.uniform(MIN_SPREAD, spread_cm)), disturb)
+
+    with (
+        DemoWriter(out, {**attrs, "task": "all", "replays_of": data.name}, 0.0) as writer,
+        contextlib.closing(in_processes(attempt, tries(), jobs)) as results,
+    ):
+        for one, got in results:
+            task = one.demo.attrs["task"]
+            figures[task]["tries"] += 1
+            if isinstance(got, str):
+                figures[task]["failures"][got] += 1
+            elif figures[task]["demos"] < wanted[task]:
+                got.attrs |= {"task": task, "source": one.source, "success": True, "embodiment": "lite6"}
+                writer.add(got)
+                figures[task]["demos"] += 1
+                frames += len(got)
+                done += 1
+            progress(done, f"{task}: {figures[task]['demos']} of {figures[task]['tries']} tries")
+    for f in figures.values():
+        f["failures"] = dict(f["failures"])
+    return {
+        "demos": done,
+        "frames": frames,
+        "tries": sum(f["tries"] for f in figures.values()),
+        "tasks": figures,
+    }
