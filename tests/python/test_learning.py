@@ -14,17 +14,18 @@ torch.set_num_threads(1)  # tests share the machine; two threads that wait for e
 
 from intabs import _core, paths  # noqa: E402
 from intabs.data.demos import Demo, load_demos, save_demos  # noqa: E402
-from intabs.data.features import Normalizer, trajectory  # noqa: E402
 from intabs.demonstrate.pick_place import PickPlace  # noqa: E402
 from intabs.errors import UserError  # noqa: E402
-from intabs.train.objective import kl_to_standard_normal  # noqa: E402
-from intabs.train.segments import SegmentSampler, _turned  # noqa: E402
-from intabs.train.trainer import Trainer, load_config, load_model  # noqa: E402
+from intabs.model.space import state_of  # noqa: E402
+from intabs.train.objective import kl_between, kl_to_standard_normal  # noqa: E402
+from intabs.train.trainer import Trainer, load_config, load_model, load_space, prepare  # noqa: E402
+from intabs.train.windows import WindowSampler, augmented, disturbed  # noqa: E402
 
 SMALL = [
     "model.pi.layers=2", "model.pi.hidden=16", "model.pi.input_linear=16",
     "model.encoder.layers=2", "model.encoder.hidden=8", "model.encoder.input_linear=8",
-    "train.batch=16", "train.steps=12", "train.warmup=2",
+    "model.eta.layers=1", "model.eta.hidden=8", "model.eta.input_linear=8",
+    "train.batch=8", "train.steps=12", "train.warmup=2", "objective.window=30",
 ]  # fmt: skip
 
 
@@ -135,36 +136,110 @@ def test_kl_is_that_of_torch():
     torch.testing.assert_close(kl_to_standard_normal(mean, log_std), want.sum(-1).mean())
 
 
-def test_small_turns_of_quaternions_agree_with_scipy():
-    from scipy.spatial.transform import Rotation
-
-    rng = np.random.default_rng(0)
-    q = Rotation.random(20, random_state=1).as_quat()
-    w = 0.01 * rng.normal(size=(20, 3))
-    want = (Rotation.from_rotvec(w) * Rotation.from_quat(q)).as_quat()
-    got = _turned(np.roll(q, 1, axis=-1), w)
-    error = np.abs(np.abs((np.roll(got, -1, axis=-1) * want).sum(-1)) - 1)
-    assert error.max() < 1e-6
+def test_kl_between_gaussians_is_that_of_torch():
+    a, b = torch.randn(2, 5, 16), 0.5 * torch.randn(2, 5, 16)
+    normal = torch.distributions.Normal
+    want = torch.distributions.kl_divergence(normal(a[0], b[0].exp()), normal(a[1], b[1].exp())).sum(-1)
+    torch.testing.assert_close(kl_between(a[0], b[0], a[1], b[1]), want)
 
 
-def test_segments_come_from_one_demonstration_and_noise_touches_only_what_pi_sees(data):
-    arm = _core.ArmModel.lite6()
+@pytest.fixture(scope="module")
+def demonstrations(data):
     demos, _ = load_demos(data)
-    raw = [trajectory(d, arm) for d in demos]
-    normalizer = Normalizer.fit(raw)
-    normal = [normalizer.normalize(t) for t in raw]
-    noise = {"object_mm": 1.0, "object_deg": 1.0, "tick_mm": 0.3, "joint_mrad": 0.5}
-    sampler = SegmentSampler(normal, normalizer, arm, (12, 16), noise, "cpu")
-    batch = sampler.sample(64, np.random.default_rng(0))
-    rows = {row.tobytes(): (k, i) for k, t in enumerate(normal) for i, row in enumerate(t.state)}
-    for segment in batch.state.numpy():
-        places = [rows[row.tobytes()] for row in segment]
-        assert len({k for k, _ in places}) == 1
-        assert [i for _, i in places] == list(range(places[0][1], places[0][1] + len(places)))
-    assert not torch.equal(batch.seen, batch.state)
-    quiet = SegmentSampler(normal, normalizer, arm, (12, 16), dict.fromkeys(noise, 0.0), "cpu")
-    batch = quiet.sample(64, np.random.default_rng(0))
-    torch.testing.assert_close(batch.seen, batch.state, atol=1e-4, rtol=0)
+    space = load_space(demos)
+    space.fit([state_of(d) for d in demos])
+    return prepare(demos, space), space
+
+
+def test_windows_are_consecutive_ticks_of_one_demonstration_and_their_skills_cover_them(demonstrations):
+    found, space = demonstrations
+    w = WindowSampler(found, space, 40, (8, 24)).sample(32, np.random.default_rng(0))
+    places = {}
+    for k, d in enumerate(found):
+        for i, row in enumerate(d.state.agent):
+            places.setdefault(row.numpy().tobytes(), []).append((k, i))
+    n = w.within.sum(1).long()
+    for b in range(32):
+        steps = int(w.mask[b].sum())
+        rows = [places[x.numpy().tobytes()] for x in w.state.agent[b, : steps + 1]]
+        assert any(all((k, i + j) in row for j, row in enumerate(rows)) for k, i in rows[0])
+        assert n[w.skill[b, :steps].unique()].sum() == steps
+        assert (w.age[b, :steps] < w.ticks[b, :steps]).all()
+    # Each skill's ticks are gathered from where the skill runs.
+    skill = w.skill.flatten()
+    for m in range(len(n)):
+        assert (skill[w.gather[m, : n[m]]] == m).all()
+    assert n[w.whole > 0].min() >= 8 and n.max() <= 40
+
+
+def test_learned_cuts_are_where_skills_begin(demonstrations):
+    found, space = demonstrations
+    cuts = [np.array([0, 20, 50, len(d.state.agent) - 1]) for d in found]
+    w = WindowSampler(found, space, 40, (8, 24), cuts=cuts).sample(64, np.random.default_rng(0))
+    starts = {tuple(d.state.agent[c].tolist()) for d, cut in zip(found, cuts, strict=True) for c in cut[:-1]}
+    begins = [tuple(w.state.agent[b, t].tolist()) for b in range(64) for t in range(40) if w.age[b, t] == 0]
+    assert set(begins) <= starts
+
+
+def test_turning_the_scene_about_the_base_changes_no_feature_but_joint_1(demonstrations):
+    found, space = demonstrations
+    w = WindowSampler(found, space, 30, (8, 24)).sample(8, np.random.default_rng(0))
+    turned = augmented(w.state, None, {"turn": 0.3}, space, np.random.default_rng(1))
+    a, b = space.raw(w.state)[0], space.raw(turned)[0]
+    assert (a[..., 0] - b[..., 0]).abs().min() > 1e-4
+    compressed = [7 + 13 * slot + 10 + i for slot in range(4) for i in range(3)]  # steep near 0
+    rest = [i for i in range(1, a.shape[-1]) if i not in compressed]
+    torch.testing.assert_close(a[..., rest], b[..., rest], atol=2e-5, rtol=0)
+    torch.testing.assert_close(a, torch.cat([a[..., :1], b[..., 1:]], -1), atol=2e-3, rtol=0)
+
+
+def test_disturbances_are_as_large_as_said(demonstrations):
+    found, space = demonstrations
+    s = WindowSampler(found, space, 30, (8, 24)).sample(64, np.random.default_rng(0)).state
+    noise = {"object_mm": 2.0, "object_deg": 3.0, "tick_mm": 0.0, "joint_mrad": 0.5}
+    d = disturbed(s, noise, np.random.default_rng(1))
+    assert (d.p - s.p).std() == pytest.approx(2e-3, rel=0.1)
+    assert torch.allclose((d.p - s.p)[:, 0], (d.p - s.p)[:, -1], atol=1e-6)
+    assert (d.agent - s.agent)[..., :6].std() == pytest.approx(5e-4, rel=0.1)
+    still = disturbed(s, dict.fromkeys(noise, 0.0), np.random.default_rng(1))
+    torch.testing.assert_close(space.raw(still)[0], space.raw(s)[0], atol=1e-6, rtol=0)
+
+
+def test_recorded_changes_move_the_state_to_the_next_one(demonstrations):
+    found, space = demonstrations
+    s = found[0].state
+    now, after = s[:-1], s[1:]
+    _, tip = space.features(now)
+    response, change = space.between(now, after)
+    got = space.move(now, tip, response * space.response_scale, change, after.agent[:, -1])
+    seen = now.known > 0
+    torch.testing.assert_close(got.agent, after.agent, atol=1e-5, rtol=0)
+    assert (got.p - after.p)[seen].abs().max() < 1e-4 and (got.R - after.R)[seen].abs().max() < 1e-3
+
+
+def test_training_starts_at_the_principal_components(data, tmp_path):
+    """The linear paths alone rebuild skills far better than random ones."""
+    config = [*SMALL, "train.steps=1"]
+    trainer = Trainer(load_config("intabs-small", config), data, tmp_path / "run", 0, "cpu")
+    started = trainer.validate()["joints"]
+    for net in trainer.model.networks().values():
+        for head in net.heads.values():
+            torch.nn.init.normal_(head.weight, std=0.01)
+            torch.nn.init.zeros_(head.bias)
+    assert started < 0.5 * trainer.validate()["joints"]
+
+
+def test_padding_does_not_change_what_an_encoder_says():
+    from intabs.model.networks import Recurrent
+
+    torch.manual_seed(0)
+    for pool in ("last", "mean"):
+        net = Recurrent(5, 2, 6, {"mean": 3}, residual=True, bidirectional=True, skip=True, pool=pool)
+        x = torch.randn(3, 9, 5)
+        mask = (torch.arange(9)[None] < torch.tensor([9, 4, 6])[:, None]).float()
+        got = net(x, mask)["mean"]
+        for row, n in zip(range(3), (9, 4, 6), strict=True):
+            torch.testing.assert_close(got[row], net(x[row : row + 1, :n])["mean"][0])
 
 
 def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not(data, tmp_path):
@@ -186,11 +261,13 @@ def test_resuming_gives_the_weights_of_an_unbroken_run(data, tmp_path):
     assert all(torch.equal(whole[k], resumed[k]) for k in whole)
 
 
-def test_training_lowers_the_held_out_error(data, tmp_path):
-    trainer = Trainer(load_config("intabs-small", [*SMALL, "train.steps=150"]), data, tmp_path / "run", 0, "cpu")
-    before = trainer.validate()["agent"]
+def test_training_learns_on_held_out_demonstrations_what_is_held(data, tmp_path):
+    trainer = Trainer(
+        load_config("intabs-small", [*SMALL, "train.steps=120", "train.lr=4.0e-3"]), data, tmp_path / "run", 0, "cpu"
+    )
+    before = trainer.validate()["held"]
     trainer.train()
-    assert trainer.validate()["agent"] < 0.7 * before
+    assert trainer.validate()["held"] < 0.8 * before
 
 
 def test_the_default_config_trains_a_step(data, tmp_path):
@@ -233,7 +310,54 @@ def test_exported_weights_give_the_same_numbers_in_cpp(data, tmp_path):
     assert verify(out) > 5e-4
 
 
-def test_the_normaliser_that_trained_is_the_one_that_runs(data, tmp_path):
+def test_exported_weights_come_back_as_the_same_model(data, tmp_path):
+    pytest.importorskip("safetensors")
+    from intabs.train.export import export, load_weights
+
     train(data, tmp_path / "run")
-    _, normalizer, checkpoint = load_model(tmp_path / "run")
-    assert checkpoint["normalizer"] == normalizer.to_dict()
+    export(tmp_path / "run", tmp_path / "weights", trials=0)
+    want, _ = load_model(tmp_path / "run")
+    got, _ = load_weights(tmp_path / "weights")
+    for (name, a), b in zip(want.state_dict().items(), got.state_dict().values(), strict=True):
+        torch.testing.assert_close(a, b, msg=name)
+
+
+def test_a_map_shows_every_skill_as_picture_and_as_page(data, tmp_path):
+    pytest.importorskip("sklearn")
+    pytest.importorskip("matplotlib")
+    from PIL import Image
+
+    from intabs.evaluate.latent import latent
+
+    trainer = train(data, tmp_path / "run", steps=2)
+    figures = latent(tmp_path / "run", data, tmp_path / "map.png")
+    assert Image.open(tmp_path / "map.png").size[0] > 500
+    skills = sum(len(trainer.boundaries.cuts(state_of(d)[0])) - 1 for d in load_demos(data)[0])
+    assert figures == {"skills": skills, "kinds": 1, "demos": 4}
+    latent(tmp_path / "run", data, tmp_path / "map.html")
+    page = (tmp_path / "map.html").read_text()
+    points = json.loads(page.split("const D=")[1].split(",S='http")[0])["points"]
+    assert len(points) == skills and all(len(p["f"]) == 5 and len(p["f"][0][0]) == 8 for p in points)
+    assert "http" not in page.replace("http://www.w3.org/2000/svg", "")  # nothing from elsewhere
+    with pytest.raises(UserError, match="must end in"):
+        latent(tmp_path / "run", data, tmp_path / "map.jpg")
+
+
+def test_evaluate_compares_kinds_of_runs_and_names_what_is_missing(data, tmp_path):
+    from intabs.evaluate.evaluate import evaluate
+
+    runs = []
+    for k, kind in enumerate(("split", "split", "joint", "agent")):
+        run = tmp_path / f"{kind}-{k}"
+        train(data, run, steps=2, seed=k, extra=[f"model.encoders={kind}"])
+        runs.append(run)
+    figures = evaluate(runs, data, None, "whole")
+    assert list(figures["methods"])[:3] == ["intabs", "tvi", "tvi-agent"] and figures["seeds"] == 2
+    assert figures["methods"]["intabs"]["sd"] > 0 == figures["methods"]["tvi"]["sd"]
+    ratio, low, high = figures["ratios"]["still"]["all"]
+    assert low <= ratio <= high
+    assert figures["methods"]["intabs"]["all"] / figures["methods"]["still"]["all"] == pytest.approx(ratio)
+    with pytest.raises(UserError, match="no run of that kind"):
+        evaluate(runs[:1], data, ["tvi"], "segment")
+    with pytest.raises(UserError, match="known are"):
+        evaluate(runs[:1], data, ["magic"], "segment")

@@ -28,7 +28,8 @@ inline constexpr int kPolicyInputDim = kStateDim + kPhaseBasis + kLatentDim * (1
 struct Action {
   JointVector dq_step = JointVector::Zero();  // step of the joint target [rad a tick]
   bool gripper_closed = false;
-  // Predicted motion of each slot's object in this tick, see ObjectMotion. A prediction, never a measurement.
+  // Predicted motion of each slot's object in this tick, see ObjectMotion: a prediction, never a measurement. Beside what
+  // the tip carries along, which pi says in a head of its own (python/intabs/model/networks.py).
   Eigen::Matrix<float, kEnvironmentActionDim, 1> object_motion = Eigen::Matrix<float, kEnvironmentActionDim, 1>::Zero();
 };
 

@@ -5,39 +5,12 @@
 #include <vector>
 
 #include "common/alloc_hook.h"
-#include "nn/random_weights.h"
+#include "policy_weights.h"
 
 namespace intabs {
 namespace {
 
 constexpr int64_t kSession = 77;
-
-std::string Numbers(int n, double value) {
-  std::string s = "[";
-  for (int i = 0; i < n; ++i) s += (i ? "," : "") + std::to_string(value);
-  return s + "]";
-}
-
-WeightsFile RandomPolicyWeights(int inputs = kStateDim + kLatentDim, const std::string& layout = kStateLayout,
-                                int64_t period = kPolicyPeriodUs) {
-  NetworkSpec spec;
-  spec.input = inputs;
-  spec.input_linear = 128;
-  spec.layers = 8;
-  spec.hidden = 128;
-  spec.residual = true;
-  spec.heads = {{"agent", kAgentActionDim}, {"environment", kEnvironmentActionDim}};
-  std::vector<uint8_t> image = SafeTensorsImage(RandomNetwork("pi", spec, 3));
-  const std::string extra = "\"state_layout\":\"" + layout + "\",\"policy_period_us\":" + std::to_string(period) +
-                            ",\"normalizer\":{\"state_mean\":" + Numbers(kStateDim, 0.1) +
-                            ",\"state_scale\":" + Numbers(kStateDim, 0.5) +
-                            ",\"agent_action_scale\":" + Numbers(kAgentActionDim, 0.01) +
-                            ",\"environment_action_scale\":" + Numbers(kEnvironmentActionDim, 0.01) + ",\"limit\":5},";
-  const std::string sha = Sha256Hex(image.data(), image.size());
-  return WeightsFile::Parse(std::move(image),
-                            Manifest::Parse(ManifestText({{"pi", spec}}, sha, extra), "weights/t/manifest.json"),
-                            "weights/t");
-}
 
 SkillController MakeController() {
   return SkillController(Policy::FromWeights(RandomPolicyWeights(), ArmModel::Lite6()), kSession);
@@ -124,7 +97,7 @@ TEST_CASE("Old poses, a driver that left, and readings that are not finite end t
   ArmCommand command;
   REQUIRE(controller.Start(1, Plan({50})) == Status::kOk);
   SECTION("old poses") {
-    r.poses.exposure_utime = r.status.utime - kMaxPoseAgeUs - 1;
+    r.poses.exposure_utime = r.status.utime - kPosesGoneUs - 1;
     CHECK(controller.Tick(r.status, r.poses, command) == Status::kNotReady);
     CHECK(controller.player().status().end_reason == EndReason::kStalePoses);
   }
@@ -147,6 +120,30 @@ TEST_CASE("Old poses, a driver that left, and readings that are not finite end t
   CHECK(command.mode == ArmMode::kHold);
 }
 
+TEST_CASE("While poses are old the plan waits and the arm is asked to hold; with new ones it goes on where it was") {
+  SkillController controller = MakeController(), undisturbed = MakeController();
+  Readings r;
+  ArmCommand command, expected;
+  REQUIRE(controller.Start(1, Plan({3})) == Status::kOk);
+  REQUIRE(undisturbed.Start(1, Plan({3})) == Status::kOk);
+  for (int tick = 0; tick < 3; ++tick) {
+    r.Advance();
+    const int64_t seen = r.status.utime;
+    for (const int64_t age : {kMaxPoseAgeUs + 1, kPosesGoneUs}) {
+      r.poses.exposure_utime = seen - age;
+      CHECK(controller.Tick(r.status, r.poses, command) == Status::kNotReady);
+      CHECK(command.mode == ArmMode::kHold);
+      CHECK(controller.player().status().end_reason == EndReason::kRunning);
+    }
+    r.poses.exposure_utime = seen - kMaxPoseAgeUs;
+    CHECK(controller.Tick(r.status, r.poses, command) == Status::kOk);
+    CHECK(undisturbed.Tick(r.status, r.poses, expected) == Status::kOk);
+    CHECK(command.mode == ArmMode::kServo);
+    CHECK(command.q_target == expected.q_target);
+  }
+  CHECK(controller.player().status().end_reason == EndReason::kFinished);
+}
+
 TEST_CASE("Plans that cannot be played are refused") {
   SkillController controller = MakeController();
   CHECK(controller.Start(1, {}) == Status::kOutOfRange);
@@ -161,9 +158,9 @@ TEST_CASE("Plans that cannot be played are refused") {
 TEST_CASE("Weights that do not fit this program are refused by name") {
   const ArmModel arm = ArmModel::Lite6();
   CHECK_THROWS_WITH(Policy::FromWeights(RandomPolicyWeights(60), arm), Catch::Contains("60 inputs"));
-  CHECK_THROWS_WITH(Policy::FromWeights(RandomPolicyWeights(kStateDim + kLatentDim, "other/1"), arm),
+  CHECK_THROWS_WITH(Policy::FromWeights(RandomPolicyWeights(kPolicyInputDim, "other/1"), arm),
                     Catch::Contains("other/1"));
-  CHECK_THROWS_WITH(Policy::FromWeights(RandomPolicyWeights(kStateDim + kLatentDim, kStateLayout, 20000), arm),
+  CHECK_THROWS_WITH(Policy::FromWeights(RandomPolicyWeights(kPolicyInputDim, kStateLayout, 20000), arm),
                     Catch::Contains("20000"));
 }
 

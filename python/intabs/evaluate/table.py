@@ -1,0 +1,125 @@
+"""One table: data sets by methods, ours beside the thesis' numbers. `tools/table`.
+
+Trains what is not there yet, each seed of each method into its folder, and goes on where it was stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+
+from intabs import paths
+from intabs.data.reader import DemoFile
+from intabs.errors import UserError
+from intabs.evaluate.evaluate import evaluate
+from intabs.output import Progress, write_json
+
+CONFIGS = {"intabs": "intabs-small", "tvi": "tvi", "tvi-agent": "tvi-agent"}
+# State reconstruction error in the thesis, on the authors' data and on training data: H-DMP, TVI, IntAbs.
+THESIS = {
+    "lite6": ("its RealWorld set", 1.12, 0.09, 0.04),
+    "roboturk": ("RoboTurk", 3.48, 0.72, 0.62),
+    "robomimic": ("RoboMimic", 2.09, 0.84, 0.58),
+    "kitchen": ("FrankaKitchen", 1.85, 0.53, 0.32),
+}
+
+
+def train(config: str, data: Path, run: Path, seed: int, settings: list[str]) -> None:
+    if (run / "result.json").exists():
+        return
+    command = [sys.executable, "-m", "intabs.cli", "train", "--config", config, "--data", str(data), "--out", str(run)]
+    command += ["--seed", str(seed), *(x for s in settings for x in ("--set", s))]
+    if (run / "checkpoint.pt").exists():
+        command.append("--resume")
+    print(f"{run}: training {config}, seed {seed}", flush=True)
+    if subprocess.run(command).returncode != 0:
+        raise UserError(f"{run}: training failed, see above")
+
+
+def about(path: Path) -> str:
+    with DemoFile(path) as f:
+        n, masks = len(f), f.masks()
+    return f"{n} demonstrations, {len(masks.get('valid', []))} held out"
+
+
+def rows(name: str, data: Path, runs: Path, seeds: int, settings: list[str], progress) -> dict:
+    sources = []
+    for config in CONFIGS.values():
+        for seed in range(seeds):
+            run = runs / name / f"{config}-{seed}"
+            train(config, data, run, seed, settings)
+            sources.append(run)
+    out = {unit: evaluate(sources, data, None, unit, progress=progress) for unit in ("segment", "whole")}
+    return {"data": str(data), "about": about(data), **out}
+
+
+def text(results: dict) -> str:
+    lines = []
+    for name, r in results.items():
+        seeds = r["segment"]["seeds"]
+        lines += [
+            f"## {name}: {r['about']}, {seeds} seed{'s' * (seeds > 1)}",
+            "| | segment all | balanced | joints | position | orientation | whole all |",
+            "|---|---|---|---|---|---|---|",
+        ]
+        for method, f in r["segment"]["methods"].items():
+            whole = r["whole"]["methods"][method]
+            sd = f" ± {f['sd']:.4f}" if f["sd"] else ""
+            lines.append(
+                f"| {method} | {f['all']:.4f}{sd} | {f['balanced']:.4f} | {f['joints']:.4f} | {f['position']:.4f} | "
+                f"{f['orientation']:.4f} | {whole['all']:.3f} |"
+            )
+        for other, k in r["segment"]["ratios"].items():
+            said = ", ".join(
+                f"{n} {k[n][0]:.2f} ({k[n][1]:.2f}-{k[n][2]:.2f})" for n in ("all", "balanced", "position")
+            )
+            lines.append(f"- intabs / {other}, segment: {said}")
+        if name in THESIS:
+            what, hdmp, tvi, ours = THESIS[name]
+            lines.append(
+                f"- The thesis on {what} (its own full data, training data): H-DMP {hdmp}, TVI {tvi}, IntAbs {ours}."
+            )
+        if r["about"].split()[0].isdigit() and int(r["about"].split()[0]) < 100:
+            lines.append("- A handful of demonstrations, not the full set.")
+        if "knn" in r["segment"]:
+            k, b = r["segment"]["knn"], r["segment"]["boundaries"]
+            lines.append(
+                f"- 5-NN {k['accuracy']:.3f} (majority {k['majority']:.3f}, untrained {k['untrained']:.3f}, PCA "
+                f"{k['pca']:.3f}); boundaries F1 {b['f1']:.3f} (fixed cut {b['fixed_cut_f1']:.3f}, mean times "
+                f"{b['mean_time_f1']:.3f})"
+            )
+        lines.append("")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="tools/table", description=__doc__.split("\n\n")[0])
+    parser.add_argument(
+        "--data", action="append", metavar="NAME=FILE",
+        help="demonstrations, HDF5 (`intabs data import`); again for more. Known to the thesis: "
+        + ", ".join(THESIS) + ". Without it: the shipped sets",
+    )  # fmt: skip
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--runs", type=Path, default=Path("runs/table"), help="where trainings are kept")
+    parser.add_argument("--set", action="append", default=[], help="a setting of the trainings, e.g. train.steps=1000")
+    parser.add_argument("--json", type=Path, help="write the figures there")
+    o = parser.parse_args()
+    shipped = [f"{n}={paths.MODELS / 'demos' / n}.hdf5" for n in ("lite6", "human")]
+    try:
+        results = {}
+        for item in o.data or shipped:
+            name, sep, file = item.partition("=")
+            if not sep or not Path(file).exists():
+                raise UserError(f"--data {item}: write NAME=FILE.hdf5, a file that is there")
+            with Progress(name, total=0) as progress:
+                results[name] = rows(name, Path(file), o.runs, o.seeds, o.set, progress.update)
+    except UserError as e:
+        raise SystemExit(f"{parser.prog}: {e}") from None
+    write_json(o.json, results)
+    print(text(results))
+
+
+if __name__ == "__main__":
+    main()
