@@ -125,8 +125,9 @@ void Bind_perception(py::module_& m) {
            "{camera:\n"
            "[{id, corners (4, 2) px, X_CT: two hypotheses (7,), reprojection_px, ambiguity, "
            "decision_margin}]}.\n"
-           "A pose not seen is held, valid for 0.5 s. RuntimeError for images that do not fit the "
-           "configuration.")
+           "A pose not seen is foretold for 0.5 s, with growing covariance, then invalid. RuntimeError for "
+           "images that do\n"
+           "not fit the configuration.")
       .def(
           "revised",
           [](const Pipeline& p) {
@@ -134,8 +135,8 @@ void Bind_perception(py::module_& m) {
             for (const ObjectPoses& poses : p.Revised()) out.append(Poses(poses));
             return out;
           },
-          "The poses of all frames since the last reset, decided anew with the frames after them in view: for "
-          "datasets. A list\n"
+          "The poses of all frames since the last reset, decided anew with the frames after them in view, "
+          "gaps of up to 0.5 s\nfilled: for datasets. A list\n"
           "of dicts as process() gives them, without tags; empty unless made with revisable=True.")
       .def("reset", &Pipeline::Reset, "As new.")
       .def("redo_extrinsics", &Pipeline::RedoExtrinsics,

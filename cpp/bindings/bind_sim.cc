@@ -14,9 +14,18 @@ namespace {
 // What the demonstrator and rollouts see of a policy tick.
 py::dict Observe(const Session& session) {
   py::array_t<double> pose({py::ssize_t{kMaxObjects}, py::ssize_t{7}});
+  py::array_t<double> truth({py::ssize_t{kMaxObjects}, py::ssize_t{7}});
+  py::array_t<float> covariance({py::ssize_t{kMaxObjects}, py::ssize_t{21}});
   py::array_t<bool> valid(kMaxObjects);
+  py::array_t<float> age(kMaxObjects);
+  const auto objects = session.world().Objects();
   for (int i = 0; i < kMaxObjects; ++i) {
+    const Pose& X = objects[i].X_WO;
+    const double is[7] = {X.p.x(), X.p.y(), X.p.z(), X.q.w(), X.q.x(), X.q.y(), X.q.z()};
+    std::copy(is, is + 7, truth.mutable_data(i, 0));
     const TrackedObject& o = session.poses().objects[i];
+    std::copy(o.covariance.begin(), o.covariance.end(), covariance.mutable_data(i, 0));
+    age.mutable_at(i) = o.age;
     const double row[7] = {o.X_WO.p.x(), o.X_WO.p.y(), o.X_WO.p.z(), o.X_WO.q.w(),
                            o.X_WO.q.x(), o.X_WO.q.y(), o.X_WO.q.z()};
     std::copy(row, row + 7, pose.mutable_data(i, 0));
@@ -32,6 +41,9 @@ py::dict Observe(const Session& session) {
   d["state"] = static_cast<int>(s.state);
   d["object_pose"] = pose;
   d["object_valid"] = valid;
+  d["object_age"] = age;
+  d["object_covariance"] = covariance;
+  d["object_truth"] = truth;
   return d;
 }
 
@@ -132,7 +144,8 @@ void Bind_sim(py::module_& m) {
            "perception_config: YAML of intabs_perception; empty: poses are the plant's truth.")
       .def("reset", &Session::Reset, py::arg("seed"), py::arg("spread_cm"), py::call_guard<py::gil_scoped_release>())
       .def("observe", &Observe,
-           "utime [us], q, dq, q_commanded (6,), gripper_closed, state, object_pose (4, 7) xyz wxyz, object_valid (4,)")
+           "utime [us], q, dq, q_commanded (6,), gripper_closed, state, object_pose (4, 7) xyz wxyz, object_valid (4,),\n"
+           "object_age (4,) [s], object_covariance (4, 21) (core/types.h), object_truth (4, 7)")
       .def(
           "command",
           [](Session& s, const JointVector& q_target, bool gripper_closed) {

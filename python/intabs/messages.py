@@ -4,6 +4,7 @@ try:
     from intabs_lcm import (
         estop_t,
         hand_keypoints_t,
+        hand_points_t,
         lite6_command_t,
         lite6_status_t,
         loop_status_t,
@@ -20,7 +21,7 @@ try:
 except ImportError as e:
     raise ImportError(f"{e}: python/intabs_lcm is missing or old, run tools/setup --runtime-only") from None
 
-# Channel -> message. TAG_DETECTIONS_<camera> and HAND_KEYPOINTS_<camera> have one channel a camera.
+# Channel -> message. TAG_DETECTIONS_, HAND_KEYPOINTS_ and HAND_POINTS_<camera> have one channel a camera.
 CHANNELS = {
     "LITE6_STATUS": lite6_status_t,
     "LITE6_COMMAND": lite6_command_t,
@@ -37,6 +38,8 @@ CHANNELS = {
     "TAG_DETECTIONS_right": tag_detections_t,
     "HAND_KEYPOINTS_left": hand_keypoints_t,
     "HAND_KEYPOINTS_right": hand_keypoints_t,
+    "HAND_POINTS_left": hand_points_t,
+    "HAND_POINTS_right": hand_points_t,
 }
 
 SKILLS_PER_PART = 16  # of a SKILL_PLAN message: 1400 bytes hold no more

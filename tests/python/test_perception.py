@@ -2,12 +2,14 @@
 
 import json
 import math
+import os
 import subprocess
 
 import numpy as np
 import pytest
 
 from intabs import _core, paths
+from intabs.demonstrate.tasks import Job, Performance
 
 CONFIG = paths.MODELS / "config" / "perception.yaml"
 
@@ -175,3 +177,89 @@ def test_the_ground_tag_tells_where_a_camera_stands(pipeline):
     looks = looks + 2 * w * np.cross(v, looks) + 2 * np.cross(v, np.cross(v, looks))
     assert math.degrees(math.acos(min(1.0, looks @ z))) < 0.5
     assert pipeline.camera_pose(1) is None
+
+
+# Each world's objects by slot. The arm at work hides tags, and what it carries leaves the table.
+WORLDS = {
+    "pick_place": {0: "block", 1: "goal"},
+    "drawer_open": {3: "drawer"},
+    "box_open": {3: "lid"},
+    "pour": {0: "cup", 1: "bowl"},
+    "stir": {1: "bowl", 2: "spoon"},
+    "drawer_open+pick_place": {0: "block", 1: "goal", 3: "drawer"},
+    "pour+stir": {0: "cup", 1: "bowl", 2: "spoon"},
+    "box_open+pour": {0: "cup", 1: "bowl", 3: "lid"},
+}
+DEMONSTRATIONS = int(os.environ.get("INTABS_WORLDS_DEMOS", "0"))  # whole ones a world; 0: the first 2 s of one
+
+
+def errors(pose: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(T, 7) each -> mm, deg."""
+    cosine = np.abs((pose[:, 3:] * truth[:, 3:]).sum(1)).clip(0, 1)
+    return 1e3 * np.linalg.norm(pose[:, :3] - truth[:, :3], axis=1), np.degrees(2 * np.arccos(cosine))
+
+
+@pytest.mark.parametrize("task", WORLDS)
+def test_objects_of_every_world_are_found_within_2_mm_and_1_5_deg_while_the_arm_works(task):
+    """The table of cpp/intabs/perception/README.md: INTABS_WORLDS_DEMOS=2 pytest -s -k every_world"""
+    session = _core.Session(str(paths.MODELS), task, str(CONFIG))
+    pose, truth, seen, frames = {}, {}, {}, 0
+    foretold: list[tuple] = []
+    for seed in range(31_000, 31_000 + max(1, DEMONSTRATIONS)):
+        job = Job(task, seed, spread=5.0, perception="tags")
+        session.reset(job.seed, job.spread)
+        performance = Performance(job)
+        begin = frames
+        for _ in range(10**6 if DEMONSTRATIONS else 50):
+            if performance.finished:
+                break
+            o = session.observe()
+            frames += 1
+            for slot in WORLDS[task]:
+                seen.setdefault(slot, []).append(bool(o["object_valid"][slot]) and o["object_age"][slot] == 0)
+                pose.setdefault(slot, []).append(o["object_pose"][slot])
+                truth.setdefault(slot, []).append(o["object_truth"][slot])
+            tick = performance.tick(o["q"], o["q_commanded"], o["object_pose"], o["object_valid"])
+            session.command(tick.q, tick.gripper_closed)
+        for slot in WORLDS[task] if DEMONSTRATIONS else ():
+            foretold += gaps(*(np.array(x[slot][begin:]) for x in (pose, truth, seen)))
+    for slot, name in WORLDS[task].items():
+        there = np.array(seen[slot])
+        mm, deg = errors(np.array(pose[slot])[there], np.array(truth[slot])[there])
+        print(
+            f"\n{task} {name}: seen in {there.mean():.3f} of {frames} frames; mm p50 {np.median(mm):.2f} p95 "
+            f"{np.quantile(mm, 0.95):.2f} max {mm.max():.2f}; deg p95 {np.quantile(deg, 0.95):.2f} max {deg.max():.2f}"
+        )
+        assert np.quantile(mm, 0.95) <= 2
+        assert np.quantile(deg, 0.95) <= 1.5
+        assert there.mean() > 0.5
+    for moves in (True, False):
+        rows = np.array([r[1:] for r in foretold if r[0] == moves])
+        if len(rows):
+            p50, p95 = np.quantile(rows[:, :4], [0.5, 0.95], axis=0).round(2).tolist()
+            what = "moves" if moves else "stands"
+            print(
+                f"{what}, {len(rows)} gaps; mm at .2 s foretold, held, at .48 s: {p50}; p95 {p95}; "
+                f"{rows[:, 4:].mean():.3f} under the 95 % quantile"
+            )
+
+
+def gaps(pose: np.ndarray, truth: np.ndarray, seen: np.ndarray) -> list[tuple]:
+    """As if nothing were seen after every 12th frame: (whether it moves by over 4 mm, errors in mm at .2 s: foretold,
+    held; at .48 s; whether they are under the 95 % quantile of chi-square with 3 degrees of freedom)."""
+    out = []
+    tracker = _core.GapTracker(sigma=0.001, sigma_angle=0.01)  # as the Pipeline's
+    for k in range(len(pose) - 12):
+        if seen[k]:
+            tracker.update(0.04 * k, pose[k])
+        if k % 12 or not seen[k]:
+            continue
+        mm, inside = [], []
+        for n in (5, 12):
+            then = tracker.predict(0.04 * (k + n))
+            guess = pose[k, :3] + then["pose"][:3] - tracker.predict(0.04 * k)["pose"][:3]
+            error = guess - truth[k + n, :3]
+            mm += [1e3 * np.linalg.norm(error), 1e3 * np.linalg.norm(pose[k, :3] - truth[k + n, :3])]
+            inside.append(error @ error < 7.815 * then["sigma"] ** 2)
+        out.append((bool(np.linalg.norm(truth[k + 12, :3] - truth[k, :3]) > 0.004), *mm, *inside))
+    return out

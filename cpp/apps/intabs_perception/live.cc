@@ -25,6 +25,10 @@ constexpr int64_t kRestartUs = 1'000'000;  // so far back: the camera's clock ha
 constexpr int kGrainyFrames = 10;  // so many frames without a row seen before: a camera with a sensor's noise
 constexpr int kOldRows = 8;        // of such a camera: so many rows seen before are an old picture's
 constexpr int kOldFrames = 25;     // so many of them: it has no noise after all (a lens cap)
+constexpr size_t kDepths = 16;      // frames that key points may come late
+constexpr size_t kKeypoints = 256;  // messages that may be early: an estimator runs ahead through a recording
+constexpr int64_t kSameFrameUs = 500;
+constexpr int64_t kLastHandsUs = 300'000;  // for key points of a recording's last frames
 constexpr double kMoving = 0.05;   // rad/s; .5 px a frame at .3 m from the base and .7 m from the camera
 
 void Say(const std::string& what) { std::fprintf(stderr, "intabs_perception: %s\n", what.c_str()); }
@@ -53,7 +57,9 @@ int SameRows(const cv::Mat& a, const cv::Mat& b) {
 }  // namespace
 
 Live::Live(const LiveOptions& options)
-    : options_(options), pipeline_(LoadPerceptionConfig(options.config)), bus_(options.lcm, options.prefix) {
+    : options_(options),
+      pipeline_(LoadPerceptionConfig(options.config), {.threads = options.threads}),
+      bus_(options.lcm, options.prefix) {
   for (const CameraModel& c : pipeline_.config().cameras) cameras_.emplace_back(c).spec = c.source;
   images_.resize(cameras_.size());
   for (const std::string& s : options.sources) {
@@ -74,6 +80,16 @@ Live::Live(const LiveOptions& options)
       throw std::runtime_error("cameras " + cameras_[0].model.name + " and " + c.model.name +
                                ": give all of them live sources, or all of them recordings, or none of them "
                                "one (the plant's ring)");
+    }
+  }
+  if (options_.hands) {
+    for (Camera& c : cameras_) {
+      bus_.Subscribe(HandKeypointsChannel(c.model.name), [&c](const HandKeypoints& k) {
+        c.keypoints.push_back(k);
+        if (c.keypoints.size() <= kKeypoints) return;
+        c.keypoints.pop_front();
+        ++c.hands_missed;
+      });
     }
   }
   if (Sourced()) {
@@ -102,7 +118,7 @@ void Live::OpenRing() {
 
 void Live::OpenSources() {
   for (Camera& c : cameras_) {
-    const CameraRequest request{c.model.name, c.model.width, c.model.height};
+    const CameraRequest request{c.model.name, c.model.width, c.model.height, options_.hands};
     WaitFor([&] { c.source = OpenSource(c.spec, request, Say); }, !IsRecording(c.spec));
   }
 }
@@ -124,6 +140,7 @@ void Live::RunBesidePlant() {
     if (bus_.Handle(100) < 0) throw std::runtime_error("LCM is broken on " + options_.lcm);
     ArmStatus status;
     if (status_.Take(status)) OnStatus(status);
+    LiftHands();
     PublishStatusNowAndThen(utime_);
   }
 }
@@ -154,6 +171,8 @@ void Live::Forget() {
   for (Camera& c : cameras_) {
     c.last_exposure_us = INT64_MIN;
     c.last_gray.release();
+    c.depths.clear();
+    c.keypoints.clear();
   }
 }
 
@@ -203,6 +222,68 @@ bool Live::IsNews(Camera& c, int64_t now_us, bool arm_moves) {
   return true;
 }
 
+void Live::RememberDepth(Camera& c) {
+  if (!options_.hands || c.frame.depth.empty()) return;
+  cv::Mat mm;
+  if (c.depths.size() >= kDepths) {
+    cv::swap(mm, c.depths.front().mm);
+    c.depths.pop_front();
+  }
+  cv::swap(mm, c.frame.depth);  // the frame gets the old one's memory
+  c.depths.push_back({c.frame.exposure_us, mm});
+}
+
+void Live::Hear() {
+  if (!options_.hands) return;
+  if (bus_.Handle(0) < 0) throw std::runtime_error("LCM is broken on " + options_.lcm);
+  LiftHands();
+}
+
+void Live::LiftHands() {
+  for (size_t i = 0; i < cameras_.size(); ++i) {
+    Camera& c = cameras_[i];
+    while (!c.keypoints.empty()) {
+      const HandKeypoints& k = c.keypoints.front();
+      const auto depth = std::find_if(c.depths.begin(), c.depths.end(), [&](const Camera::Depth& d) {
+        return std::abs(d.exposure_us - k.exposure_utime) <= kSameFrameUs;
+      });
+      const bool found = depth != c.depths.end();
+      // Its frame is still to come, unless a later one was looked at (what comes without depth has none).
+      if (!found && k.exposure_utime > c.last_exposure_us) break;
+      if (found && pipeline_.X_WC(static_cast<int>(i)) && pipeline_.in_place(static_cast<int>(i))) {
+        LiftHand(static_cast<int>(i), k, depth->mm);
+        ++c.hands;
+      } else {
+        ++c.hands_missed;
+      }
+      c.keypoints.pop_front();
+    }
+  }
+}
+
+void Live::LiftHand(int camera, const HandKeypoints& k, const cv::Mat& depth) {
+  static_assert(kHandPoints == kNumHandPoints);
+  Camera& c = cameras_[camera];
+  HandFrame frame;
+  frame.time = 1e-6 * static_cast<double>(k.exposure_utime);
+  for (int i = 0; i < kHandPoints; ++i) frame.pixels[i] = {k.uv[i][0], k.uv[i][1]};
+  frame.hand_C = intabs::LiftHand(c.model, frame.pixels, depth, 1e-3);
+  frame.X_WC = *pipeline_.X_WC(camera);
+  const HandEstimate hand = c.hand.Update(frame);
+  TrackedHand m;
+  m.utime = utime_;
+  m.exposure_utime = k.exposure_utime;
+  m.seq = c.hands + 1;
+  m.frame_seq = k.frame_seq;
+  m.score = k.score;
+  for (int i = 0; i < kHandPoints; ++i) {
+    for (int axis = 0; axis < 3; ++axis) m.p_W[i][axis] = static_cast<float>(hand.hand_W.p[i][axis]);
+    m.sigma[i] = static_cast<float>(hand.sigma[i]);
+    m.state[i] = static_cast<uint8_t>(hand.hand_W.state[i]);
+  }
+  bus_.Publish(HandPointsChannel(c.model.name), m);
+}
+
 void Live::Look(int64_t frame_seq, int64_t now_us, bool arm_moves) {
   frame_seq_ = frame_seq;
   int64_t newest_us = INT64_MIN;
@@ -218,7 +299,10 @@ void Live::Look(int64_t frame_seq, int64_t now_us, bool arm_moves) {
       c.fresh = false;
     }
     images_[i] = c.fresh ? c.last_gray : cv::Mat();
-    if (c.fresh) ++c.frames;
+    if (c.fresh) {
+      ++c.frames;
+      RememberDepth(c);
+    }
     c.fresh = false;
   }
   // Without any image too: then the answer is that nothing was seen, and nobody waits for us in vain.
@@ -271,15 +355,31 @@ void Live::RunCameras() {
     const int64_t now_us = MonotonicUs();
     utime_ = now_us;
     PublishStatusNowAndThen(now_us);
-    if (first_us > 0 ? all || now_us - first_us > kTogetherUs : now_us - looked_us > kSilenceUs) {
-      // Where the writer's clock is not ours (a simulation's), nothing can be said of lateness.
-      const bool our_clock = std::abs(clock_us) < kPatienceUs;
-      Look(frame_seq_ + 1, our_clock ? now_us : now_us + clock_us, false);
+    // Where the writer's clock is not ours (a simulation's), nothing can be said of lateness.
+    const bool our_clock = std::abs(clock_us) < kPatienceUs;
+    const int64_t there_us = our_clock ? now_us : now_us + clock_us;
+    if (first_us == 0 && now_us - looked_us > kSilenceUs && poses_.frame_seq > 0) {
+      PublishSilence(there_us);
+      looked_us = now_us;
+    } else if (first_us > 0 ? all || now_us - first_us > kTogetherUs : now_us - looked_us > kSilenceUs) {
+      Look(frame_seq_ + 1, there_us, false);
       first_us = 0;
       looked_us = now_us;
     }
+    Hear();
   }
   for (Camera& c : cameras_) c.grabber.reset();
+}
+
+void Live::PublishSilence(int64_t now_us) {
+  ObjectPoses poses = poses_;
+  poses.utime = now_us;
+  for (TrackedObject& o : poses.objects) {
+    if (o.id < 0) continue;
+    o.age += static_cast<float>(1e-6 * static_cast<double>(now_us - poses_.exposure_utime));
+    o.valid = o.valid && o.age <= 1e-6 * Pipeline::kGapUs;
+  }
+  bus_.Publish(kObjectPoses, poses);
 }
 
 // Paced as recorded; no frame is left out.
@@ -291,7 +391,13 @@ void Live::RunRecordings() {
       if (c.frame.frame_seq == c.last_seq && !c.ended) c.ended = c.source->Next(c.frame) == Grab::kEnd;
       if (!c.ended) next_us = std::min(next_us, c.frame.exposure_us);
     }
-    if (next_us == INT64_MAX) return;
+    if (next_us == INT64_MAX) {
+      for (const int64_t over_us = MonotonicUs(); options_.hands && MonotonicUs() - over_us < kLastHandsUs;) {
+        std::this_thread::sleep_for(std::chrono::milliseconds(10));
+        Hear();
+      }
+      return;
+    }
     if (begin_us == 0) {
       begin_us = MonotonicUs();
       first_us = next_us;
@@ -300,6 +406,7 @@ void Live::RunRecordings() {
       const int64_t left_us = next_us - first_us - (MonotonicUs() - begin_us);
       std::this_thread::sleep_for(std::chrono::microseconds(std::clamp<int64_t>(left_us, 0, 50'000)));
       PublishStatusNowAndThen(utime_);
+      Hear();
     }
     for (Camera& c : cameras_) {
       c.fresh = !c.ended && c.frame.exposure_us - next_us <= kTogetherUs;
@@ -307,6 +414,7 @@ void Live::RunRecordings() {
     }
     utime_ = next_us;
     Look(frame_seq_ + 1, next_us, false);
+    Hear();
     PublishStatusNowAndThen(utime_);
   }
 }
@@ -366,6 +474,10 @@ void Live::WriteJson() const {
                                         {"late", c.late},
                                         {"doubled", c.doubled},
                                         {"torn", c.torn}};
+    if (options_.hands) {
+      figures["cameras"][c.model.name]["hands"] = c.hands;
+      figures["cameras"][c.model.name]["hands_missed"] = c.hands_missed;
+    }
   }
   std::ofstream out(options_.json);
   out << figures.dump(2) << "\n";

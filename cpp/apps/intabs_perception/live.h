@@ -3,6 +3,7 @@
 
 #include <array>
 #include <condition_variable>
+#include <deque>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -13,6 +14,7 @@
 #include "intabs/camera/frame_ring.h"
 #include "intabs/camera/frame_source.h"
 #include "intabs/camera/grabber.h"
+#include "intabs/perception/hand_tracker.h"
 #include "intabs/perception/pipeline.h"
 #include "intabs/rt/tick_stats.h"
 
@@ -25,6 +27,8 @@ struct LiveOptions {
   std::string config = "models/config/perception.yaml";
   std::vector<std::string> sources;  // "CAMERA=KIND:WHERE", before what `config` says
   std::string json;                  // empty: none
+  int threads = 1;                   // of the tag detector
+  bool hands = false;                // HAND_KEYPOINTS_* and depth -> HAND_POINTS_*
 };
 
 // Without sources: beside a plant. A LITE6_STATUS with a new last_frame_seq asks for that frame of the
@@ -35,6 +39,9 @@ struct LiveOptions {
 //
 // Poses are those of the exposure that they are stamped with: what came twice, or after a newer one, is
 // counted and not looked at.
+//
+// Hands: key points meet the depth of the frame with the same exposure time; they may come before or after
+// it, in the order of the frames.
 class Live {
  public:
   // Throws when the configuration or LCM does not hold, or a camera does not turn up within 5 s.
@@ -66,6 +73,15 @@ class Live {
     int64_t reported = 0;  // frames at the last PERCEPTION_STATUS
     TickStats detect_us;   // since then
     bool lost_said = false, moved_said = false;
+
+    struct Depth {
+      int64_t exposure_us;
+      cv::Mat mm;
+    };
+    std::deque<Depth> depths;            // of the last frames, oldest first
+    std::deque<HandKeypoints> keypoints;  // whose frame was not looked at yet
+    HandTracker hand;
+    int64_t hands = 0, hands_missed = 0;  // key points that became points in space, or did not
   };
 
   void OpenRing();
@@ -79,7 +95,13 @@ class Live {
   void CountGap(Camera& camera);
   // Looks at what is fresh: poses and detections go out.
   void Look(int64_t frame_seq, int64_t now_us, bool arm_moves);
+  // What was seen last, as of then, grown older: a frame that is only late is still news.
+  void PublishSilence(int64_t now_us);
   bool IsNews(Camera& camera, int64_t now_us, bool arm_moves);
+  void RememberDepth(Camera& camera);
+  void Hear();  // what came over the bus, where nothing else waits for it
+  void LiftHands();
+  void LiftHand(int camera, const HandKeypoints& keypoints, const cv::Mat& depth);
   void Forget();  // time starts again
   void PublishStatusNowAndThen(int64_t utime);
   void PublishStatus();

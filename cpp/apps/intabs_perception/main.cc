@@ -16,7 +16,8 @@ int Main(int argc, char** argv) {
   FramesOptions frames;
   CLI::App app{
       "Object poses from camera frames: frames of a plant's ring, or of cameras, in; OBJECT_POSES, "
-      "TAG_DETECTIONS_*, PERCEPTION_STATUS out. With --frames: the frames of a folder."};
+      "TAG_DETECTIONS_*, PERCEPTION_STATUS out, with --hands HAND_POINTS_* too. With --frames: the frames of a "
+      "folder."};
   AddYamlConfig(app, live.config, {kConfigKeys.begin(), kConfigKeys.end()},
                 "YAML file: cameras, ground tag, objects and their tags; options too");
   app.add_option("--lcm", live.lcm, "LCM URL")->capture_default_str();
@@ -26,6 +27,12 @@ int Main(int argc, char** argv) {
                  "CAMERA=KIND:WHERE, once a camera, instead of the plant's ring: ring:/NAME, v4l2:DEVICE, "
                  "realsense:SERIAL, folder:DIR, video:FILE; also as `source` of a camera in the YAML file")
       ->allow_extra_args(false);
+  app.add_option("--threads", live.threads, "of the tag detector")
+      ->capture_default_str()
+      ->check(CLI::Range(1, 64));
+  app.add_flag("--hands", live.hands,
+               "points of hands in space too: HAND_KEYPOINTS_<camera> in, HAND_POINTS_<camera> out, where "
+               "the source has depth");
   app.add_option("--json", live.json, "write the figures there at the end");
   auto* dir = app.add_option("--frames", frames.dir, "solve the frames of this folder's frames.json instead");
   auto* result = app.add_option("--result", frames.result, "where their poses go")->needs(dir);

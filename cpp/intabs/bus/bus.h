@@ -41,6 +41,10 @@ inline const Channel<Reset> kReset{"RESET"};
 inline Channel<TagDetections> TagDetectionsChannel(const std::string& camera) {
   return {"TAG_DETECTIONS_" + camera};
 }
+inline Channel<HandKeypoints> HandKeypointsChannel(const std::string& camera) {
+  return {"HAND_KEYPOINTS_" + camera};
+}
+inline Channel<TrackedHand> HandPointsChannel(const std::string& camera) { return {"HAND_POINTS_" + camera}; }
 
 // One thread at a time. Not real-time safe as a whole: a publish is one system call, without allocation for
 // the messages of the arm.

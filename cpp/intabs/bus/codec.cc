@@ -7,6 +7,8 @@
 
 #include "intabs/bus/messages.h"
 #include "intabs_lcm/estop_t.hpp"
+#include "intabs_lcm/hand_keypoints_t.hpp"
+#include "intabs_lcm/hand_points_t.hpp"
 #include "intabs_lcm/lite6_command_t.hpp"
 #include "intabs_lcm/lite6_status_t.hpp"
 #include "intabs_lcm/loop_status_t.hpp"
@@ -375,6 +377,52 @@ bool FromLcm(const intabs_lcm::perception_status_t& l, PerceptionStatus& m) {
          AllFinite(m.detect_us_p95);
 }
 
+void ToLcm(const HandKeypoints& m, intabs_lcm::hand_keypoints_t& l) {
+  l.utime = m.utime;
+  l.exposure_utime = m.exposure_utime;
+  l.seq = m.seq;
+  l.frame_seq = m.frame_seq;
+  for (int i = 0; i < kNumHandPoints; ++i) std::copy(m.uv[i].begin(), m.uv[i].end(), l.uv[i]);
+  l.score = m.score;
+}
+bool FromLcm(const intabs_lcm::hand_keypoints_t& l, HandKeypoints& m) {
+  m.utime = l.utime;
+  m.exposure_utime = l.exposure_utime;
+  m.seq = l.seq;
+  m.frame_seq = l.frame_seq;
+  m.score = l.score;
+  for (int i = 0; i < kNumHandPoints; ++i) {
+    std::copy(std::begin(l.uv[i]), std::end(l.uv[i]), m.uv[i].begin());
+    if (!AllFinite(m.uv[i])) return false;
+  }
+  return Finite(m.score);
+}
+
+void ToLcm(const TrackedHand& m, intabs_lcm::hand_points_t& l) {
+  l.utime = m.utime;
+  l.exposure_utime = m.exposure_utime;
+  l.seq = m.seq;
+  l.frame_seq = m.frame_seq;
+  for (int i = 0; i < kNumHandPoints; ++i) std::copy(m.p_W[i].begin(), m.p_W[i].end(), l.p_W[i]);
+  std::copy(m.sigma.begin(), m.sigma.end(), l.sigma);
+  std::copy(m.state.begin(), m.state.end(), l.state);
+  l.score = m.score;
+}
+bool FromLcm(const intabs_lcm::hand_points_t& l, TrackedHand& m) {
+  m.utime = l.utime;
+  m.exposure_utime = l.exposure_utime;
+  m.seq = l.seq;
+  m.frame_seq = l.frame_seq;
+  m.score = l.score;
+  for (int i = 0; i < kNumHandPoints; ++i) {
+    std::copy(std::begin(l.p_W[i]), std::end(l.p_W[i]), m.p_W[i].begin());
+    if (!AllFinite(m.p_W[i])) return false;
+  }
+  std::copy(std::begin(l.sigma), std::end(l.sigma), m.sigma.begin());
+  std::copy(std::begin(l.state), std::end(l.state), m.state.begin());
+  return AllFinite(m.sigma) && Finite(m.score);
+}
+
 void ToLcm(const PlantControl& m, intabs_lcm::plant_control_t& l) {
   l.utime = m.utime;
   l.seq = m.seq;
@@ -449,6 +497,10 @@ struct Wire<SkillStatus> : PlainWire<intabs_lcm::skill_status_t> {};
 template <>
 struct Wire<PerceptionStatus> : PlainWire<intabs_lcm::perception_status_t> {};
 template <>
+struct Wire<HandKeypoints> : PlainWire<intabs_lcm::hand_keypoints_t> {};
+template <>
+struct Wire<TrackedHand> : PlainWire<intabs_lcm::hand_points_t> {};
+template <>
 struct Wire<Reset> : PlainWire<intabs_lcm::reset_t> {};
 template <>
 struct Wire<TagDetections> : CountWire<intabs_lcm::tag_detections_t, kDetectionsCountAt, kMaxTags> {};
@@ -489,6 +541,8 @@ INTABS_MESSAGE(SkillPlan)
 INTABS_MESSAGE(SkillStatus)
 INTABS_MESSAGE(LoopStatus)
 INTABS_MESSAGE(PerceptionStatus)
+INTABS_MESSAGE(HandKeypoints)
+INTABS_MESSAGE(TrackedHand)
 INTABS_MESSAGE(PlantControl)
 INTABS_MESSAGE(Estop)
 INTABS_MESSAGE(Reset)

@@ -67,6 +67,29 @@ struct PerceptionStatus {
   std::array<float, kMaxCameras> fps{}, detect_us_p50{}, detect_us_p95{};
 };
 
+inline constexpr int kNumHandPoints = 21;  // in MediaPipe's order
+
+// What a 2-D estimator found in one picture of one camera.
+struct HandKeypoints {
+  int64_t utime = 0;
+  int64_t exposure_utime = 0;  // of the frame
+  int64_t seq = 0;
+  int64_t frame_seq = 0;
+  std::array<std::array<float, 2>, kNumHandPoints> uv{};  // px; over 2e4: not seen
+  float score = 0;
+};
+
+struct TrackedHand {
+  int64_t utime = 0;           // when it was computed
+  int64_t exposure_utime = 0;  // of the frame
+  int64_t seq = 0;
+  int64_t frame_seq = 0;
+  std::array<std::array<float, 3>, kNumHandPoints> p_W{};  // [m]; zero where nothing is known
+  std::array<float, kNumHandPoints> sigma{};               // of a coordinate [m]
+  std::array<uint8_t, kNumHandPoints> state{};             // perception/hand.h PointState
+  float score = 0;                                         // of the key points
+};
+
 struct PlantControl {
   int64_t utime = 0;
   int64_t seq = 0;

@@ -16,7 +16,7 @@
 namespace intabs {
 namespace {
 
-constexpr uint64_t kMagic = 0x31474e5246424149;  // "IABFRNG1": also the layout's version
+constexpr uint64_t kMagic = 0x32474e5246424149;  // "IABFRNG2": also the layout's version
 constexpr size_t kNameSize = 32;
 constexpr int64_t kMaxPixels = int64_t{1} << 26;
 constexpr int kMaxSlots = 1024;
@@ -25,7 +25,7 @@ static_assert(std::atomic<int64_t>::is_always_lock_free);
 
 struct Header {
   std::atomic<uint64_t> magic;  // written last
-  int32_t num_cameras, width, height, slots;
+  int32_t num_cameras, width, height, slots, depth;
   char names[kMaxCameras][kNameSize];
   alignas(64) std::atomic<int64_t> newest[kMaxCameras];
 };
@@ -35,31 +35,35 @@ struct alignas(64) Slot {
   std::atomic<int64_t> version, frame_seq, exposure_us;
 };
 
-// Layout: Header, Slot[cameras * slots], pixels[cameras * slots], each picture padded to whole words.
+// Layout: Header, Slot[cameras * slots], then for each slot its pixels and, where there is depth, its depths,
+// both padded to whole words.
 struct Layout {
   int num_cameras, width, height, slots;
+  bool depth;
+  static size_t Padded(size_t bytes) { return (bytes + 63) / 64 * 64; }
   size_t bytes() const { return size_t{3} * width * height; }
-  size_t padded() const { return (bytes() + 63) / 64 * 64; }
+  size_t depth_bytes() const { return depth ? size_t{2} * width * height : 0; }
+  size_t slot_bytes() const { return Padded(bytes()) + Padded(depth_bytes()); }
   size_t count() const { return size_t(num_cameras) * slots; }
-  size_t total() const { return sizeof(Header) + count() * (sizeof(Slot) + padded()); }
+  size_t total() const { return sizeof(Header) + count() * (sizeof(Slot) + slot_bytes()); }
 };
 
 // Seqlocks need their data to be atomic too (H.-J. Boehm, "Can seqlocks get along with programming language
 // memory models?", 2012). Release stores and acquire loads of the words take the place of fences: who sees
 // one word of a new picture also sees that the slot's version has changed.
-void StoreWords(uint64_t* shared, const uint8_t* from, size_t bytes) noexcept {
+void StoreWords(uint64_t* shared, const void* from, size_t bytes) noexcept {
   for (size_t i = 0; i < bytes; i += 8) {
     uint64_t word = 0;
-    std::memcpy(&word, from + i, std::min<size_t>(8, bytes - i));
+    if (from) std::memcpy(&word, static_cast<const char*>(from) + i, std::min<size_t>(8, bytes - i));
     std::atomic_ref(shared[i / 8]).store(word, std::memory_order_release);
   }
 }
 
-void LoadWords(const uint64_t* shared, uint8_t* to, size_t bytes) noexcept {
+void LoadWords(const uint64_t* shared, void* to, size_t bytes) noexcept {
   for (size_t i = 0; i < bytes; i += 8) {
     const uint64_t word =
         std::atomic_ref(const_cast<uint64_t&>(shared[i / 8])).load(std::memory_order_acquire);
-    std::memcpy(to + i, &word, std::min<size_t>(8, bytes - i));
+    std::memcpy(static_cast<char*>(to) + i, &word, std::min<size_t>(8, bytes - i));
   }
 }
 
@@ -92,8 +96,9 @@ struct Mapping {
   }
   uint64_t* pixels(size_t i) const {
     char* first = static_cast<char*>(memory) + sizeof(Header) + layout.count() * sizeof(Slot);
-    return reinterpret_cast<uint64_t*>(first + i * layout.padded());
+    return reinterpret_cast<uint64_t*>(first + i * layout.slot_bytes());
   }
+  uint64_t* depths(size_t i) const { return pixels(i) + Layout::Padded(layout.bytes()) / 8; }
   size_t Index(int camera, int64_t frame_seq) const {
     return size_t(camera) * layout.slots + frame_seq % layout.slots;
   }
@@ -125,8 +130,8 @@ struct FrameRingWriter::Map {
 };
 
 FrameRingWriter::FrameRingWriter(const std::string& name, const std::vector<std::string>& cameras, int width,
-                                 int height, int slots) {
-  const Layout layout{static_cast<int>(cameras.size()), width, height, slots};
+                                 int height, int slots, bool depth) {
+  const Layout layout{static_cast<int>(cameras.size()), width, height, slots, depth};
   if (cameras.empty() || cameras.size() > kMaxCameras) {
     throw Error(name,
                 std::to_string(cameras.size()) + " cameras; it holds 1 to " + std::to_string(kMaxCameras));
@@ -164,13 +169,15 @@ FrameRingWriter::FrameRingWriter(const std::string& name, const std::vector<std:
   h.width = width;
   h.height = height;
   h.slots = slots;
+  h.depth = layout.depth;
   for (size_t i = 0; i < cameras.size(); ++i) std::strcpy(h.names[i], cameras[i].c_str());
   h.magic.store(kMagic, std::memory_order_release);
 }
 
 FrameRingWriter::~FrameRingWriter() = default;
 
-void FrameRingWriter::Write(int camera, int64_t frame_seq, int64_t exposure_us, const uint8_t* rgb) noexcept {
+void FrameRingWriter::Write(int camera, int64_t frame_seq, int64_t exposure_us, const uint8_t* rgb,
+                            const uint16_t* depth) noexcept {
   const Mapping& ring = map_->ring;
   if (camera < 0 || camera >= ring.layout.num_cameras || frame_seq < 1) return;
   const size_t i = ring.Index(camera, frame_seq);
@@ -180,6 +187,7 @@ void FrameRingWriter::Write(int camera, int64_t frame_seq, int64_t exposure_us, 
   slot.frame_seq.store(frame_seq, std::memory_order_release);
   slot.exposure_us.store(exposure_us, std::memory_order_release);
   StoreWords(ring.pixels(i), rgb, ring.layout.bytes());
+  StoreWords(ring.depths(i), depth, ring.layout.depth_bytes());
   slot.version.store(version + 2, std::memory_order_release);
   ring.header().newest[camera].store(frame_seq, std::memory_order_release);
 }
@@ -208,7 +216,7 @@ FrameRingReader::FrameRingReader(const std::string& name) {
   if (base == MAP_FAILED) throw Error(name, std::string("cannot be mapped: ") + std::strerror(errno));
   const Header& h = *static_cast<const Header*>(base);
   const bool ready = h.magic.load(std::memory_order_acquire) == kMagic;
-  const Layout layout{h.num_cameras, h.width, h.height, h.slots};
+  const Layout layout{h.num_cameras, h.width, h.height, h.slots, h.depth != 0};
   const bool sane = ready && layout.num_cameras >= 1 && layout.num_cameras <= kMaxCameras &&
                     layout.width >= 1 && layout.height >= 1 &&
                     int64_t{layout.width} * layout.height <= kMaxPixels && layout.slots >= 1 &&
@@ -235,6 +243,7 @@ int FrameRingReader::FindCamera(const std::string& name) const {
 
 int FrameRingReader::width() const { return map_->layout.width; }
 int FrameRingReader::height() const { return map_->layout.height; }
+bool FrameRingReader::has_depth() const { return map_->layout.depth; }
 
 int64_t FrameRingReader::newest_seq() const noexcept {
   int64_t newest = INT64_MAX;
@@ -262,6 +271,13 @@ FrameRead FrameRingReader::Read(int64_t frame_seq, int camera, Frame& out) const
   if (!out.rgb.isContinuous()) out.rgb.release();
   out.rgb.create(map_->layout.height, map_->layout.width, CV_8UC3);
   LoadWords(map_->pixels(i), out.rgb.data, map_->layout.bytes());
+  if (map_->layout.depth) {
+    if (!out.depth.isContinuous()) out.depth.release();
+    out.depth.create(map_->layout.height, map_->layout.width, CV_16UC1);
+    LoadWords(map_->depths(i), out.depth.data, map_->layout.depth_bytes());
+  } else {
+    out.depth.release();
+  }
   return slot.version.load(std::memory_order_relaxed) == version ? FrameRead::kWhole : FrameRead::kTorn;
 }
 

@@ -29,6 +29,7 @@ constexpr auto kSuspicion = milliseconds(500);  // so long without a frame: is t
 constexpr auto kFirstRetry = milliseconds(100), kLastRetry = milliseconds(3000);
 constexpr int64_t kFolderPeriodUs = 40000;
 constexpr size_t kStampDigits = 10;
+const std::string kColor = "_o", kDepthFile = "_depth.png";
 
 int64_t NowUs() {  // CLOCK_MONOTONIC, like the drivers' stamps
   return std::chrono::duration_cast<std::chrono::microseconds>(steady_clock::now().time_since_epoch())
@@ -129,6 +130,7 @@ class FolderSource : public FrameSource {
  public:
   FolderSource(const std::string& folder, const CameraRequest& camera) : folder_(folder), camera_(camera) {
     std::error_code error;
+    bool deep = false;
     for (const auto& entry : std::filesystem::directory_iterator(folder, error)) {
       std::string ending = entry.path().extension().string();
       std::transform(ending.begin(), ending.end(), ending.begin(),
@@ -136,6 +138,11 @@ class FolderSource : public FrameSource {
       for (const char* known : {".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff"}) {
         if (ending == known) files_.push_back(entry.path());
       }
+      deep = deep || entry.path().filename().string().ends_with(kDepthFile);
+    }
+    if (deep) {
+      std::erase_if(files_,
+                    [](const std::filesystem::path& f) { return !f.stem().string().ends_with(kColor); });
     }
     if (error) throw std::runtime_error(folder + ": " + error.message());
     if (files_.empty())
@@ -146,8 +153,10 @@ class FolderSource : public FrameSource {
   Grab Next(Frame& out) override {
     if (next_ == files_.size()) return Grab::kEnd;
     const std::filesystem::path& file = files_[next_++];
-    const std::string stem = file.stem().string();
-    const bool stamp = stem.size() >= kStampDigits && stem.size() <= 18 &&
+    std::string stem = file.stem().string();
+    const bool deep = stem.ends_with(kColor);
+    if (deep) stem.resize(stem.size() - kColor.size());
+    const bool stamp = stem.size() >= (deep ? 1 : kStampDigits) && stem.size() <= 18 &&
                        std::all_of(stem.begin(), stem.end(), [](char c) { return c >= '0' && c <= '9'; });
     out.frame_seq = static_cast<int64_t>(next_);
     out.exposure_us = stamp ? std::stoll(stem) : out.frame_seq * kFolderPeriodUs;
@@ -158,10 +167,22 @@ class FolderSource : public FrameSource {
     }
     DemandSize(file.string(), camera_, bgr.cols, bgr.rows);
     cv::cvtColor(bgr, out.rgb, cv::COLOR_BGR2RGB);
+    out.depth.release();
+    if (deep && camera_.depth) ReadDepth(file.parent_path() / (stem + kDepthFile), bgr.size(), out.depth);
     return Grab::kFrame;
   }
 
  private:
+  // None where there is no such file, or a broken one.
+  static void ReadDepth(const std::filesystem::path& file, cv::Size size, cv::Mat& depth) {
+    if (!std::filesystem::exists(file)) return;
+    depth = cv::imread(file, cv::IMREAD_UNCHANGED);
+    if (!depth.empty() && (depth.type() != CV_16UC1 || depth.size() != size))
+      throw std::runtime_error(file.string() + ": a depth picture must have 16 bits and be as large as " +
+                               "its colour picture, " + std::to_string(size.width) + " x " +
+                               std::to_string(size.height));
+  }
+
   const std::string folder_;
   const CameraRequest camera_;
   std::vector<std::filesystem::path> files_;

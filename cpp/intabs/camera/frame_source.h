@@ -22,13 +22,14 @@ class FrameSource {
   virtual ~FrameSource() = default;
 
   // Waits for the next frame, a live camera's newest, a fraction of a second or until the camera gives up.
-  // Reuses out.rgb's memory. Throws std::runtime_error in one line where reading breaks down for good.
+  // Reuses out's memory. Throws std::runtime_error in one line where reading breaks down for good.
   virtual Grab Next(Frame& out) = 0;
 };
 
 struct CameraRequest {
   std::string name;           // in messages, and in a ring of several cameras
   int width = 0, height = 0;  // 0: as they come
+  bool depth = false;         // wanted beside the colours, where the source has it: ring, folder, RealSense
 };
 
 // Whether `spec` is a recording: every frame of it counts, at its own time, and it ends.
@@ -39,8 +40,8 @@ bool IsRecording(const std::string& spec);
 //   v4l2:DEVICE      through OpenCV; exposure times are the driver's (CLOCK_MONOTONIC)
 //   realsense:SERIAL or realsense: (any one); only where librealsense2 was found at configure time
 //   folder:DIR       its pictures by name; a name that is a number of 10 digits or more is the exposure time
-//   in us,
-//                    otherwise they are 40 ms apart
+//                    in us, otherwise they are 40 ms apart. NAME_o.jpg or .png is a colour picture with its
+//                    depth (16 bits, mm) in NAME_depth.png; there NAME may have fewer digits
 //   video:FILE       of constant rate, through OpenCV
 // Throws std::runtime_error in one line when there is none, or its pictures have another size.
 //

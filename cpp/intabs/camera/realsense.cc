@@ -7,6 +7,7 @@
 #include <chrono>
 #include <cmath>
 #include <librealsense2/rs.hpp>
+#include <optional>
 
 namespace intabs {
 namespace {
@@ -17,6 +18,10 @@ class RealSenseSource : public FrameSource {
     rs2::config config;
     if (!serial.empty()) config.enable_device(serial);
     config.enable_stream(RS2_STREAM_COLOR, camera.width, camera.height, RS2_FORMAT_RGB8);
+    if (camera.depth) {
+      config.enable_stream(RS2_STREAM_DEPTH, RS2_FORMAT_Z16);
+      align_.emplace(RS2_STREAM_COLOR);
+    }
     try {
       const rs2::pipeline_profile profile = pipeline_.start(config);
       // Stamps of the sensor itself, turned into the host's time by the library.
@@ -37,6 +42,11 @@ class RealSenseSource : public FrameSource {
     } catch (const rs2::error& e) {
       throw std::runtime_error(std::string("RealSense: ") + e.what());
     }
+    try {
+      if (align_) frames = align_->process(frames);
+    } catch (const rs2::error& e) {
+      throw std::runtime_error(std::string("RealSense: ") + e.what());
+    }
     const rs2::video_frame color = frames.get_color_frame();
     if (!color) return Grab::kNone;
     out.frame_seq = static_cast<int64_t>(color.get_frame_number());
@@ -49,11 +59,19 @@ class RealSenseSource : public FrameSource {
     const cv::Mat view(color.get_height(), color.get_width(), CV_8UC3, const_cast<void*>(color.get_data()),
                        static_cast<size_t>(color.get_stride_in_bytes()));
     view.copyTo(out.rgb);
+    out.depth.release();
+    if (const rs2::depth_frame depth = frames.get_depth_frame(); align_ && depth) {
+      const cv::Mat counts(depth.get_height(), depth.get_width(), CV_16UC1,
+                           const_cast<void*>(depth.get_data()),
+                           static_cast<size_t>(depth.get_stride_in_bytes()));
+      counts.convertTo(out.depth, CV_16UC1, 1000 * depth.get_units());
+    }
     return Grab::kFrame;
   }
 
  private:
   rs2::pipeline pipeline_;
+  std::optional<rs2::align> align_;
 };
 
 }  // namespace

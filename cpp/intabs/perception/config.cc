@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cctype>
 #include <cerrno>
 #include <charconv>
 #include <cmath>
@@ -16,12 +17,13 @@
 #include <stdexcept>
 #include <vector>
 
+#include "intabs/core/text.h"
 #include "intabs/core/types.h"
 
 namespace intabs {
 namespace {
 
-[[noreturn]] void Fail(const std::string& what) { throw std::runtime_error(what); }
+[[noreturn]] void Fail(const std::string& what) { throw std::runtime_error(OneLine(what)); }
 
 // Every map says which keys it has: a misspelt key is an error, not a silent default.
 void AllowOnly(const cv::FileNode& map, const std::string& where, const std::vector<const char*>& keys) {
@@ -240,14 +242,45 @@ void Check(const PerceptionConfig& config) {
 
 namespace {
 
+constexpr char kHeading[] = "%YAML:1.0\n---\n";  // OpenCV insists on it
+
+// Whether a YAML document begins or ends in this line. OpenCV may look for ever for what follows.
+bool HoldsMark(const std::string& line) {
+  char quote = 0, last = 0;  // open; before here, but for blanks
+  for (size_t i = 0; i < line.size(); ++i) {
+    const char c = line[i];
+    if (quote != 0) {
+      if (c == quote) quote = 0;
+      if (c == '\\') ++i;
+      continue;
+    }
+    if (c == '#') return false;
+    const bool between = last == 0 || last == '}' || last == ']' || last == '"' || last == '\'';
+    if (between && (line.compare(i, 3, "...") == 0 || line.compare(i, 3, "---") == 0)) return true;
+    if (c == '"' || c == '\'') quote = c;
+    if (c != ' ' && c != '\t') last = c;
+  }
+  return false;
+}
+
 // read(root, folder of the file).
 template <class F>
 auto Load(const std::string& path, const F& read) {
   std::ifstream file(path);
   if (!file) Fail(path + ": cannot be read");
   std::stringstream text;
-  text << "%YAML:1.0\n---\n";  // the heading that OpenCV insists on
+  text << kHeading;
+  bool begun = false;
   for (std::string line; std::getline(file, line);) {
+    if (HoldsMark(line)) {
+      if (!begun && line.starts_with("---")) line.clear();
+      if (!line.empty()) Fail(path + ": not readable as YAML: one document a file, take out \"...\" and \"---\"");
+    }
+    if (const size_t at = line.find_first_not_of(" \t\r"); !begun && at != std::string::npos && line[at] != '#') {
+      // A list or map in brackets has an end too, and OpenCV the same trouble with what follows it.
+      if (!std::isalpha(static_cast<unsigned char>(line[at]))) Fail(path + ": top level: expected a map of values, KEY: VALUE");
+      begun = true;
+    }
     const std::string key = line.substr(0, line.find(':'));
     const bool option = std::find(kProgramKeys.begin(), kProgramKeys.end(), key) != kProgramKeys.end();
     text << (option ? "" : line) << "\n";
@@ -263,7 +296,7 @@ auto Load(const std::string& path, const F& read) {
     Fail(path + ": not readable as YAML: " +
          (placed ? "line " + std::to_string(std::atoi(e.func.c_str() + 1) - 2) + e.func.substr(at + 1)
                  : e.err));
-  } catch (const std::runtime_error& e) {
+  } catch (const std::exception& e) {  // of the reader too: texts it cannot make
     Fail(path + ": " + e.what());
   }
 }

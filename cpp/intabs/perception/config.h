@@ -43,7 +43,7 @@ struct PerceptionConfig {
 // at here.
 inline constexpr std::array kConfigKeys = {"cameras", "ground",   "objects",    "corner_sigma_px",
                                            "X_WB",    "hand_eye", "calibration"};
-inline constexpr std::array kProgramKeys = {"lcm", "prefix", "ring", "json"};
+inline constexpr std::array kProgramKeys = {"lcm", "prefix", "ring", "json", "threads", "hands"};
 
 // Throws std::runtime_error that names the field and its value: no camera, a tag or id used twice, sizes <=
 // 0, ...

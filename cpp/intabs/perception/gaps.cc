@@ -250,12 +250,12 @@ void GapTracker::Advance(double dt, Pose& X, Eigen::Vector3d& v, Eigen::Vector3d
   turn.Advance(dt, options_.decay, options_.angular_speed_sigma);
 }
 
-bool GapTracker::Update(double time, const Pose& measured) noexcept {
+bool GapTracker::Update(double time, const Pose& measured, double sigma, double sigma_angle) noexcept {
   if (!std::isfinite(time) || !measured.IsFinite() || std::abs(measured.q.norm() - 1) > 1e-3) return false;
+  if (!(sigma > 0 && sigma_angle > 0)) return false;
   if (seen_ && time <= time_) return false;
   if (seen_ && time - time_ > options_.max_gap) seen_ = false;
-  const double r2 = options_.sigma * options_.sigma;
-  const double ra2 = options_.sigma_angle * options_.sigma_angle;
+  const double r2 = sigma * sigma, ra2 = sigma_angle * sigma_angle;
   if (!seen_) {
     X_ = measured;
     v_.setZero();

@@ -75,9 +75,13 @@ class GapTracker {
  public:
   explicit GapTracker(const GapTrackerOptions& options = {}) : options_(options) {}
 
-  // Takes a measurement at `time` [s]. False, and nothing changes, when time does not rise or the pose is not
-  // finite. After more than max_gap it starts anew.
-  [[nodiscard]] bool Update(double time, const Pose& measured) noexcept;
+  // Takes a measurement at `time` [s]. False, and nothing changes, when time does not rise, the pose is not
+  // finite or a deviation is not positive. After more than max_gap it starts anew.
+  [[nodiscard]] bool Update(double time, const Pose& measured) noexcept {
+    return Update(time, measured, options_.sigma, options_.sigma_angle);
+  }
+  // The same for one that is as good as sigma [m] and sigma_angle [rad] say.
+  [[nodiscard]] bool Update(double time, const Pose& measured, double sigma, double sigma_angle) noexcept;
   // The estimate for a time not before the last measurement (earlier ones get that of the last measurement).
   [[nodiscard]] GapEstimate Predict(double time) const noexcept;
   void Reset() noexcept { seen_ = false; }

@@ -177,7 +177,8 @@ HandPoints LiftHand(const CameraModel& camera, const HandPixels& pixels, const H
   return Lift(camera, pixels, gated, options);
 }
 
-void DropFixedPlaces(std::span<const HandFrame> frames, std::span<HandPoints> hands, double still_px) {
+void DropFixedPlaces(std::span<const HandFrame> frames, std::span<HandPoints> hands, double still_px,
+                     bool goes_on) {
   // A visit: detections between two leaps or two pauses.
   struct Visit {
     std::vector<size_t> frames;
@@ -238,6 +239,9 @@ void DropFixedPlaces(std::span<const HandFrame> frames, std::span<HandPoints> ha
   if (path.empty()) return;  // nothing that moves: nothing to tell a stain from a hand by
   for (const Visit& v : visits) {
     if (!v.still || !v.leapt) continue;
+    const bool just_now = v.frames.back() + 1 == frames.size() &&
+                          frames[v.frames.back()].time - frames[v.frames.front()].time < kPause;
+    if (goes_on && just_now) continue;
     const auto near = [&](const Eigen::Vector2d& at) { return (at - v.place).norm() <= 3 * still_px; };
     if (std::any_of(path.begin(), path.end(), near)) continue;
     for (const size_t k : v.frames) {
@@ -339,7 +343,7 @@ std::vector<HandPoints> FilterHand(std::span<const HandFrame> frames, const Hand
       if (Measured(hands[k], i)) hands[k].p[i] = frames[k].X_WC * hands[k].p[i];
     }
   }
-  if (options.fixed_place) DropFixedPlaces(frames, hands, options.still_px);
+  if (options.fixed_place) DropFixedPlaces(frames, hands, options.still_px, options.goes_on);
   if (options.bones) {
     for (HandPoints& hand : hands) DropLongBones(hand, options.bone_share, options.bone_slack);
   }

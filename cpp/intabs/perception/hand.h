@@ -73,6 +73,7 @@ struct HandFilterOptions {
   double finger_speed = 1.5;        // of a key point beside the palm [m/s]
   double jump_slack = 0.025;        // what noise may add [m]
   double still_px = 3.0;            // a detection that moves less sticks
+  bool goes_on = false;             // more frames follow: what leapt just now has had no time to move
   GapOptions gaps{.sigma = 0.005};  // max_gap 0: nothing is filled
 };
 
@@ -91,7 +92,8 @@ std::vector<HandPoints> FilterHand(std::span<const HandFrame> frames, const Hand
 // The parts of FilterHand, each on its own.
 // Marks kFixedPlace: detections that keep to one place of the picture within still_px, reached or left by a
 // leap, and that no moving hand ever passes.
-void DropFixedPlaces(std::span<const HandFrame> frames, std::span<HandPoints> hands, double still_px);
+void DropFixedPlaces(std::span<const HandFrame> frames, std::span<HandPoints> hands, double still_px,
+                     bool goes_on = false);
 // Marks kBone: the fewest points, the worst first, so that no bone and no reach from the wrist is too long. A
 // palm of half the size or less is no hand: all of it goes.
 void DropLongBones(HandPoints& hand, double share, double slack);

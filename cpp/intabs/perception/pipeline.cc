@@ -22,7 +22,17 @@ constexpr double kFacing = 0.1;         // cosine; tags seen more obliquely are 
 // where it was (TagDetector) or by a scan.
 constexpr double kObjectMarginPx = 12;
 constexpr double kGroundMarginPx = 6;
+// What errors in a row have in common must not look like motion.
+constexpr double kGapSigma = 1e-3;       // [m]
+constexpr double kGapSigmaAngle = 1e-2;  // [rad]
 constexpr int kSlowScan = 4;  // what is missing for long is looked for in each camera every so many frames
+
+double Square(double v) { return v * v; }
+
+// Of one coordinate, with `more` beside it.
+double Sigma(const Eigen::Matrix3d& covariance, double more) {
+  return std::sqrt(covariance.trace() / 3 + Square(more));
+}
 
 double RmsDistance(const TagCorners& a, const TagCorners& b) {
   double sum = 0;
@@ -64,7 +74,7 @@ void Pipeline::Reset() {
   for (const ObjectModel& o : config_.objects) {
     for (const ObjectTag& t : o.tags) ids.push_back(t.id);
   }
-  tracks_.assign(config_.objects.size(), {});
+  tracks_.assign(config_.objects.size(), Track());
   pose_tracks_.assign(config_.objects.size(), {});
   records_.clear();
   const DetectorOptions detector{.threads = options_.threads, .budget_px = kBudgetPx};
@@ -154,7 +164,7 @@ std::vector<cv::Rect> Pipeline::Expected(const Camera& camera, int64_t exposure_
   if (config_.ground) add(config_.ground->X_WT, config_.ground->size, kGroundMarginPx);
   for (size_t i = 0; i < tracks_.size(); ++i) {
     const Track& track = tracks_[i];
-    if (!track.seen || exposure_us - track.seen_us > kHoldUs) continue;
+    if (!track.seen || exposure_us - track.seen_us > kGapUs) continue;
     const auto predicted = pose_tracks_[i].Predicted(1e-6 * static_cast<double>(exposure_us));
     const Pose X_WO = predicted.value_or(track.X_WO);
     for (const ObjectTag& t : config_.objects[i].tags) add(X_WO * t.X_OT, t.size, kObjectMarginPx);
@@ -197,7 +207,7 @@ void Pipeline::Process(const GrayImages& images, int64_t frame_seq, int64_t expo
     }
   }
   if (seq_ == 0 || exposure_us < last_us_) {
-    tracks_.assign(tracks_.size(), {});
+    tracks_.assign(tracks_.size(), Track());
     pose_tracks_.assign(pose_tracks_.size(), {});
   }
   last_us_ = exposure_us;
@@ -288,10 +298,12 @@ void Pipeline::Report(const ObjectModel& model, const Sight& sight, const PoseTr
   if (believed) {
     const ObjectPose& chosen = sight.poses[verdict.hypothesis];
     track.X_WO = chosen.X_WO;
-    track.covariance =
-        PackCovariance(sight.agreed && sight.poses.size() == 2
+    track.covariance = sight.agreed && sight.poses.size() == 2
                            ? CovarianceOfChoice(chosen, sight.poses[1 - verdict.hypothesis], verdict.p_wrong)
-                           : chosen.covariance);
+                           : chosen.covariance;
+    (void)track.gap.Update(1e-6 * static_cast<double>(exposure_us), chosen.X_WO,
+                           Sigma(track.covariance.bottomRightCorner<3, 3>(), kGapSigma),
+                           Sigma(track.covariance.topLeftCorner<3, 3>(), kGapSigmaAngle));
     track.seen = true;
     track.seen_us = exposure_us;
     track.missing_frames = 0;
@@ -304,10 +316,61 @@ void Pipeline::Report(const ObjectModel& model, const Sight& sight, const PoseTr
   if (!track.seen || (object.id >= 0 && object.age <= age)) return;
   object.id = model.id;
   object.X_WO = track.X_WO;
-  object.covariance = track.covariance;
+  object.covariance = PackCovariance(track.covariance);
   object.cameras = cameras;
   object.age = age;
-  object.valid = exposure_us - track.seen_us <= kHoldUs;
+  object.valid = exposure_us - track.seen_us <= kGapUs;
+  if (!believed) Foretell(track, exposure_us, object);
+}
+
+// The last pose, moved on as the tracker moved since then: nothing leaps when a gap begins.
+void Pipeline::Foretell(const Track& track, int64_t exposure_us, TrackedObject& object) {
+  const GapEstimate then = track.gap.Predict(1e-6 * static_cast<double>(track.seen_us));
+  const GapEstimate now =
+      track.gap.Predict(1e-6 * static_cast<double>(std::min(exposure_us, track.seen_us + kGapUs)));
+  object.X_WO = {track.X_WO.p + now.pose.p - then.pose.p,
+                 (track.X_WO.q * then.pose.q.conjugate() * now.pose.q).normalized()};
+  Matrix6d covariance = track.covariance;
+  covariance.diagonal().head<3>().array() += Square(now.sigma_angle) - Square(then.sigma_angle);
+  covariance.diagonal().tail<3>().array() += Square(now.sigma) - Square(then.sigma);
+  object.covariance = PackCovariance(covariance);
+}
+
+// In place of predictions what lies between two poses; where there is none, nobody knows.
+void Pipeline::FillBetween(const ObjectModel& model, std::span<ObjectPoses> frames) {
+  std::vector<TrackedObject*> objects;
+  std::vector<double> time;
+  std::vector<Pose> pose;
+  std::vector<SampleState> state;
+  for (ObjectPoses& frame : frames) {
+    TrackedObject& object = frame.objects[model.slot];
+    const double t = 1e-6 * static_cast<double>(frame.exposure_utime);
+    if (object.id != model.id || (!time.empty() && t <= time.back())) continue;
+    objects.push_back(&object);
+    time.push_back(t);
+    pose.push_back(object.X_WO);
+    state.push_back(object.cameras != 0 ? SampleState::kMeasured : SampleState::kInvalid);
+  }
+  std::vector<double> sigma(time.size());
+  FillGaps(time, pose, state, {.max_gap = 1e-6 * kGapUs, .sigma = kGapSigma}, sigma);
+  GapTracker fresh;  // how a rotation's variance grows away from a pose
+  (void)fresh.Update(0, Pose{}, kGapSigma, kGapSigmaAngle);
+  size_t before = 0, after = 0;
+  for (size_t k = 0; k < time.size(); ++k) {
+    if (state[k] == SampleState::kMeasured) {
+      before = k;
+      continue;
+    }
+    objects[k]->valid = state[k] == SampleState::kFilled;
+    if (!objects[k]->valid) continue;
+    for (after = std::max(after, k); state[after] != SampleState::kMeasured;) ++after;
+    const double a = Square(fresh.Predict(time[k] - time[before]).sigma_angle);
+    const double b = Square(fresh.Predict(time[after] - time[k]).sigma_angle);
+    Vector6d variance;
+    variance << Eigen::Vector3d::Constant(a * b / (a + b)), Eigen::Vector3d::Constant(Square(sigma[k]));
+    objects[k]->X_WO = pose[k];
+    objects[k]->covariance = PackCovariance(variance.asDiagonal());
+  }
 }
 
 std::vector<ObjectPoses> Pipeline::Revised() const {
@@ -328,6 +391,7 @@ std::vector<ObjectPoses> Pipeline::Revised() const {
       for (size_t r = begin; r < end; ++r) {
         Report(config_.objects[i], records_[r].sights[i], evidence[r - begin], track, out[r]);
       }
+      FillBetween(config_.objects[i], std::span(out).subspan(begin, end - begin));
     }
   }
   return out;

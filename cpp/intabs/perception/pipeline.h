@@ -7,12 +7,14 @@
 #include <cstdint>
 #include <opencv2/core/mat.hpp>
 #include <optional>
+#include <span>
 #include <utility>
 #include <vector>
 
 #include "intabs/core/types.h"
 #include "intabs/perception/config.h"
 #include "intabs/perception/detector.h"
+#include "intabs/perception/gaps.h"
 #include "intabs/perception/object_solver.h"
 #include "intabs/perception/pose_track.h"
 
@@ -28,9 +30,9 @@ struct PipelineOptions {
 
 class Pipeline {
  public:
-  // A pose stays valid for so long after the last frame that showed it: arm and fingers hide tags for
+  // A pose is foretold for so long after the last frame that showed it: arm and fingers hide tags for
   // moments.
-  static constexpr int64_t kHoldUs = 500000;
+  static constexpr int64_t kGapUs = 500000;
   // The camera's place is the mean over so many frames of the ground tag, then fixed.
   static constexpr int kGroundFrames = 10;
 
@@ -45,9 +47,9 @@ class Pipeline {
   //   Seen: pose and covariance of this frame, cameras that contributed, age 0, valid. Which of two poses it
   //   is, and
   //     whether this frame can be believed, is told by all frames so far (PoseTrack).
-  //   Not seen, not believed, or still ambiguous: the last pose with age growing, cameras 0; valid up to an
-  //   age of
-  //     kHoldUs, invalid after it (the pose is kept, the age grows on).
+  //   Not seen, not believed, or still ambiguous: where the last poses lead (GapTracker), with a covariance
+  //     that grows from that of the last one, age since then, cameras 0; valid up to an age of kGapUs,
+  //     invalid after it (the last prediction is kept, the age grows on).
   //   Never seen: as an unused slot (id -1, null pose, invalid, age 0).
   // A camera contributes once the ground tag showed where it stands, and not in a frame that shows the ground
   // tag elsewhere (moved camera, swapped cables). detections: what each camera saw, at most kMaxTags each,
@@ -57,7 +59,8 @@ class Pipeline {
   void Process(const GrayImages& images, int64_t frame_seq, int64_t exposure_us, ObjectPoses& out,
                CameraDetections& detections);
 
-  // The poses of all frames since the last Reset(), decided anew with those after them in view. Only with
+  // The poses of all frames since the last Reset(), decided anew with those after them in view; gaps of up to
+  // kGapUs between two poses are filled (FillGaps), all else that was not seen is invalid. Only with
   // PipelineOptions::revisable, else empty.
   std::vector<ObjectPoses> Revised() const;
 
@@ -86,8 +89,9 @@ class Pipeline {
     std::vector<SeenTag> seen;  // corners in ideal pixels (camera_model.h)
   };
   struct Track {
-    Pose X_WO;
-    std::array<float, 21> covariance{};
+    Pose X_WO;  // of the last frame that showed it
+    Matrix6d covariance = Matrix6d::Zero();
+    GapTracker gap;
     bool seen = false;  // ever
     int64_t seen_us = 0;
     int missing_frames = 0;  // since it was seen last
@@ -104,6 +108,8 @@ class Pipeline {
 
   static void Report(const ObjectModel& model, const Sight& sight, const PoseTrack::Evidence& evidence,
                      Track& track, ObjectPoses& out);
+  static void Foretell(const Track& track, int64_t exposure_us, TrackedObject& object);
+  static void FillBetween(const ObjectModel& model, std::span<ObjectPoses> frames);
 
   void Place(Camera& camera);
   bool ScanDue(int camera) const;

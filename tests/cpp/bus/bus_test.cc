@@ -45,6 +45,8 @@ void ForEachChannel(F f) {
   f(kEstop);
   f(kReset);
   f(TagDetectionsChannel("left"));
+  f(HandKeypointsChannel("left"));
+  f(HandPointsChannel("left"));
 }
 
 template <class M>

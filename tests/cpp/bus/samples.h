@@ -174,6 +174,39 @@ inline bool Same(const TagDetections& a, const TagDetections& b) {
 }
 
 template <>
+inline HandKeypoints Largest() {
+  Counter c;
+  auto m = Head<HandKeypoints>(c);
+  m.exposure_utime = c.Int();
+  m.frame_seq = c.Int();
+  for (auto& uv : m.uv) uv = {static_cast<float>(c()), static_cast<float>(c())};
+  m.score = static_cast<float>(c());
+  return m;
+}
+inline bool Same(const HandKeypoints& a, const HandKeypoints& b) {
+  return a.utime == b.utime && a.seq == b.seq && a.exposure_utime == b.exposure_utime &&
+         a.frame_seq == b.frame_seq && a.uv == b.uv && a.score == b.score;
+}
+
+template <>
+inline TrackedHand Largest() {
+  Counter c;
+  auto m = Head<TrackedHand>(c);
+  m.exposure_utime = c.Int();
+  m.frame_seq = c.Int();
+  for (auto& p : m.p_W) p = {static_cast<float>(c()), static_cast<float>(c()), static_cast<float>(c())};
+  for (float& s : m.sigma) s = static_cast<float>(c());
+  for (size_t i = 0; i < m.state.size(); ++i) m.state[i] = static_cast<uint8_t>(i + 1);
+  m.score = static_cast<float>(c());
+  return m;
+}
+inline bool Same(const TrackedHand& a, const TrackedHand& b) {
+  return a.utime == b.utime && a.seq == b.seq && a.exposure_utime == b.exposure_utime &&
+         a.frame_seq == b.frame_seq && a.p_W == b.p_W && a.sigma == b.sigma && a.state == b.state &&
+         a.score == b.score;
+}
+
+template <>
 inline SkillPlan Largest() {
   Counter c;
   auto m = Head<SkillPlan>(c);

@@ -74,6 +74,46 @@ TEST_CASE("What is written into the ring is read from it, camera by camera") {
   CHECK(std::equal(other.begin(), other.end(), frame.rgb.data));
 }
 
+TEST_CASE("A ring with depth gives it beside the colours, one without gives none") {
+  const std::string name = RingName();
+  FrameRingWriter writer(name, kCameras, 37, 11, 3, true);  // 814 bytes: no whole number of words
+  const FrameRingReader reader(name);
+  REQUIRE(reader.has_depth());
+  std::vector<uint16_t> depth(37 * 11);
+  for (size_t i = 0; i < depth.size(); ++i) depth[i] = static_cast<uint16_t>(i * 161);
+  for (const int camera : {0, 1}) {  // the slots lie side by side
+    for (int seq = 1; seq <= 3; ++seq) {
+      depth[0] = static_cast<uint16_t>(10 * camera + seq);
+      writer.Write(camera, seq, 1000, Picture(37, 11, 100 + 10 * camera + seq).data(), depth.data());
+    }
+  }
+  Frame frame;
+  for (const int camera : {0, 1}) {
+    for (int seq = 1; seq <= 3; ++seq) {
+      CAPTURE(camera, seq);
+      REQUIRE(reader.Read(seq, camera, frame) == FrameRead::kWhole);
+      depth[0] = static_cast<uint16_t>(10 * camera + seq);
+      REQUIRE(frame.depth.type() == CV_16UC1);
+      REQUIRE(frame.depth.size() == cv::Size(37, 11));
+      CHECK(std::equal(depth.begin(), depth.end(), frame.depth.ptr<uint16_t>()));
+      const std::vector<uint8_t> rgb = Picture(37, 11, 100 + 10 * camera + seq);
+      CHECK(std::equal(rgb.begin(), rgb.end(), frame.rgb.data));
+    }
+  }
+  writer.Write(0, 4, 1000, Picture(37, 11, 1).data());  // without depth this time: nothing has one
+  REQUIRE(reader.Read(4, 0, frame) == FrameRead::kWhole);
+  CHECK(std::all_of(frame.depth.ptr<uint16_t>(), frame.depth.ptr<uint16_t>() + 37 * 11,
+                    [](uint16_t v) { return v == 0; }));
+
+  const std::string flat = RingName();
+  FrameRingWriter colour(flat, kCameras, 37, 11);
+  colour.Write(0, 1, 1000, Picture(37, 11, 1).data(), depth.data());
+  const FrameRingReader flat_reader(flat);
+  CHECK_FALSE(flat_reader.has_depth());
+  REQUIRE(flat_reader.Read(1, 0, frame) == FrameRead::kWhole);
+  CHECK(frame.depth.empty());
+}
+
 TEST_CASE("Frames that are not written yet, overwritten already, or of no camera are not read") {
   const std::string name = RingName();
   FrameRingWriter writer(name, kCameras, 16, 8, 3);

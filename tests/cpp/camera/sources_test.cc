@@ -78,6 +78,31 @@ TEST_CASE("A folder gives its pictures by name, 40 ms apart or at the times that
   CHECK(source->Next(frame) == Grab::kEnd);
 }
 
+TEST_CASE("A folder of colour and depth pictures gives both, those of one name together") {
+  const Folder folder;
+  const bool wanted = GENERATE(true, false);
+  for (int i = 0; i < 3; ++i) {
+    const std::string name = folder.path + "/" + std::to_string(790154000 + 40000 * i);
+    cv::imwrite(name + "_o.png", cv::Mat(kHeight, kWidth, CV_8UC3, cv::Scalar(10, 20, 30 + i)));
+    if (i != 1) cv::imwrite(name + "_depth.png", cv::Mat(kHeight, kWidth, CV_16UC1, cv::Scalar(500 + i)));
+  }
+  CameraRequest camera = kLeft;
+  camera.depth = wanted;
+  const auto source = OpenSource("folder:" + folder.path, camera, Silent);
+  Frame frame;
+  for (int i = 0; i < 3; ++i) {
+    CAPTURE(i, wanted);
+    REQUIRE(source->Next(frame) == Grab::kFrame);
+    CHECK(frame.exposure_us == 790154000 + 40000 * i);
+    CHECK(frame.rgb.at<cv::Vec3b>(5, 5)[0] == 30 + i);
+    REQUIRE(frame.depth.empty() == (i == 1 || !wanted));
+    if (!frame.depth.empty()) CHECK(frame.depth.at<uint16_t>(5, 5) == 500 + i);
+  }
+  CHECK(source->Next(frame) == Grab::kEnd);
+  cv::imwrite(folder.path + "/790154000_depth.png", cv::Mat(kHeight, kWidth, CV_8UC1, cv::Scalar(9)));
+  if (wanted) CHECK_THAT(RefusalOf("folder:" + folder.path, camera), Catch::Contains("must have 16 bits"));
+}
+
 TEST_CASE("A picture of a folder that cannot be read comes as an empty frame, the others as they are") {
   const Folder folder;
   for (const char* name : {"1.png", "2.png", "3.png"})

@@ -326,6 +326,48 @@ TEST_CASE(
   REQUIRE_FALSE(tracker.Predict(t + 0.6).valid);
 }
 
+TEST_CASE("Velocities of the tracker die away with their time constant, between measurements too") {
+  const double decay = GENERATE(0.1, 0.3, 1.0);
+  GapTracker tracker({.max_gap = 5, .sigma = 1e-5, .sigma_angle = 1e-5, .decay = decay});
+  const Eigen::Vector3d v(0.3, -0.1, 0.2), w(0.4, 0.2, -0.6);
+  const Pose start{{0.1, 0.2, 0.3}, ExpSO3({0.3, 0.2, -0.1})};
+  double t = 0;
+  for (; t < 1; t += 0.01) {
+    REQUIRE(tracker.Update(t, {start.p + t * v, (start.q * ExpSO3(t * w)).normalized()}));
+  }
+  t -= 0.01;
+  const Pose last = tracker.Predict(t).pose;
+  const auto gone = [&](double dt) { return (tracker.Predict(t + dt).pose.p - last.p).norm(); };
+  const auto turned = [&](double dt) { return AngleBetween(tracker.Predict(t + dt).pose.q, last.q); };
+  CHECK(gone(0.01) == Approx(0.01 * v.norm()).epsilon(0.1));
+  CHECK(turned(0.01) == Approx(0.01 * w.norm()).epsilon(0.1));
+  // The way gone in equal times shrinks by exp(-dt / decay).
+  const double keep = std::exp(-0.2 / decay);
+  CHECK((gone(0.4) - gone(0.2)) / gone(0.2) == Approx(keep).epsilon(1e-6));
+  CHECK((turned(0.4) - turned(0.2)) / turned(0.2) == Approx(keep).epsilon(1e-4));
+  // A measurement that tells nothing changes nothing of all that.
+  const GapEstimate straight = tracker.Predict(t + 0.5);
+  REQUIRE(tracker.Update(t + 0.2, {{9, 9, 9}, Eigen::Quaterniond(0, 1, 0, 0)}, 1e7, 1e7));
+  REQUIRE(tracker.Update(t + 0.3, {{9, 9, 9}, Eigen::Quaterniond(0, 1, 0, 0)}, 1e7, 1e7));
+  const GapEstimate stepped = tracker.Predict(t + 0.5);
+  CHECK((stepped.pose.p - straight.pose.p).norm() < 1e-6);
+  CHECK(AngleBetween(stepped.pose.q, straight.pose.q) < 1e-6);
+  CHECK(stepped.sigma == Approx(straight.sigma).epsilon(1e-6));
+  CHECK(stepped.sigma_angle == Approx(straight.sigma_angle).epsilon(1e-6));
+}
+
+TEST_CASE("The tracker follows a good measurement more closely than a bad one") {
+  GapTracker good, bad;
+  for (GapTracker* tracker : {&good, &bad}) REQUIRE(tracker->Update(0, Pose{}));
+  const Pose moved{{0.02, 0, 0}, Eigen::Quaterniond::Identity()};
+  REQUIRE(good.Update(0.1, moved, 1e-4, 1e-3));
+  REQUIRE(bad.Update(0.1, moved, 0.1, 1));
+  CHECK(good.Predict(0.1).pose.p.x() == Approx(0.02).epsilon(1e-3));
+  CHECK(bad.Predict(0.1).pose.p.x() < 0.01);
+  CHECK(good.Predict(0.1).sigma < bad.Predict(0.1).sigma);
+  REQUIRE_FALSE(good.Update(0.2, moved, 0, 1));
+}
+
 TEST_CASE("The tracker refuses what is no measurement") {
   GapTracker tracker;
   REQUIRE(tracker.Update(1.0, Pose{}));

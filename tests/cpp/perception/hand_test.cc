@@ -1,4 +1,4 @@
-#include "intabs/perception/hand.h"
+#include "intabs/perception/hand_tracker.h"
 
 #include <algorithm>
 #include <catch2/catch.hpp>
@@ -281,6 +281,56 @@ TEST_CASE("Short gaps are filled in W, long ones stay open, also with a camera t
     for (int i = 0; i < kHandPoints; ++i)
       REQUIRE((hands[k].p[i] - truth[k][i]).norm() < (gap ? 0.005 : 1e-9));
   }
+}
+
+TEST_CASE(
+    "As frames come, what no hand does goes in the very frame, and what is missing is foretold for a while") {
+  std::vector<HandFrame> frames = Sweep(90);
+  std::vector<Points> truth;
+  const Points elsewhere = OpenHand({0.1, 0.1, 1.6});
+  for (int k = 0; k < 90; ++k) {
+    frames[k].X_WC = {{0.5, 0.3, 0.7}, ExpSO3({2, 0.1, 0})};
+    truth.push_back(frames[k].hand_C.p);
+    for (Eigen::Vector3d& p : truth.back()) p = frames[k].X_WC * p;
+    if (k >= 20 && k < 23) Replace(frames[k], elsewhere);
+    if (k == 35) frames[k].hand_C.p[8] += Eigen::Vector3d(0, 0, 0.12);
+    if (k >= 45 && k < 70) Unsee(frames[k]);
+  }
+  HandTracker tracker;
+  double sigma = 0;
+  for (int k = 0; k < 90; ++k) {
+    CAPTURE(k);
+    const HandEstimate hand = tracker.Update(frames[k]);
+    const bool gap = (k >= 20 && k < 23) || (k >= 45 && k < 60);  // 15 frames: half a second
+    const bool lost = k >= 60 && k < 70;
+    const int filled = Count(hand.hand_W, PointState::kFilled);
+    if (k == 35) {  // the fingertip goes, and perhaps a neighbour with it
+      REQUIRE(hand.hand_W.state[8] == PointState::kFilled);
+      REQUIRE(filled <= 2);
+    } else {
+      REQUIRE(filled == (gap ? kHandPoints : 0));
+    }
+    REQUIRE(Count(hand.hand_W, PointState::kUnseen) == (lost ? kHandPoints : 0));
+    for (int i = 0; i < kHandPoints; ++i) {
+      const double error = (hand.hand_W.p[i] - truth[k][i]).norm();
+      if (lost) {
+        REQUIRE(hand.hand_W.p[i] == Eigen::Vector3d::Zero());
+        REQUIRE(hand.sigma[i] == 0);
+      } else if (hand.hand_W.state[i] == PointState::kFilled) {
+        REQUIRE(hand.sigma[i] > 0.005);
+        REQUIRE(error < 4 * std::sqrt(3) * hand.sigma[i]);
+        if (k < 45) REQUIRE(error < 0.03);
+      } else {
+        REQUIRE(error < 1e-9);
+        REQUIRE(hand.sigma[i] == 0.005);
+      }
+    }
+    if (gap && k > 45) REQUIRE(hand.sigma[0] > sigma);
+    sigma = hand.sigma[0];
+  }
+  // Time that goes back starts anew: nothing is foretold from before.
+  Unsee(frames[0]);
+  REQUIRE(Count(tracker.Update(frames[0]).hand_W, PointState::kUnseen) == kHandPoints);
 }
 
 }  // namespace intabs

@@ -113,27 +113,65 @@ TEST_CASE("Objects that move are found where they are, in W, from the first fram
   }
 }
 
-TEST_CASE("A pose is held for half a second without tags, then invalid with growing age") {
+TEST_CASE("Without tags a pose is foretold for half a second with growing covariance, then invalid") {
   World world;
   Pipeline pipeline(world.config);
   ObjectPoses poses;
   CameraDetections seen;
-  pipeline.Process(world.See(), 1, 0, poses, seen);
-  REQUIRE(poses.objects[0].valid);
-  const Pose last = poses.objects[0].X_WO;
+  const Eigen::Vector3d velocity(0, .2, .1);  // [m/s]
+  const Eigen::Vector3d rate(0, 0, .5);       // [rad/s], in O
+  const double period = 1e-6 * kFrameUs;
+  const bool moves = GENERATE(false, true);
+  const auto step = [&] {
+    if (!moves) return;
+    world.block.p += period * velocity;
+    world.block.q = (world.block.q * ExpSO3(period * rate)).normalized();
+  };
+  int64_t t = 0;
+  for (int i = 0; i < 8; ++i, t += kFrameUs, step()) pipeline.Process(world.See(), i + 1, t, poses, seen);
+  const TrackedObject& block = poses.objects[0];
+  REQUIRE(block.valid);
+  REQUIRE(block.age == 0);
+  const TrackedObject last = block;
   const GrayImages empty = world.See({});
-  for (int i = 1; i <= 20; ++i) {
-    pipeline.Process(empty, i + 1, i * kFrameUs, poses, seen);
+  double sigma = last.covariance[15], sigma_angle = last.covariance[0];  // variances
+  Pose at_end;
+  for (int i = 1; i <= 20; ++i, t += kFrameUs, step()) {
+    pipeline.Process(empty, i + 8, t, poses, seen);
+    INFO("moves " << moves << ", frame " << i << " of the gap: " << Millimetres(block, world.block) << " mm, "
+                  << Degrees(block, world.block) << " deg");
     CHECK(seen[0].n == 0);
-    CHECK(poses.objects[0].X_WO.p == last.p);
-    CHECK(poses.objects[0].age == Approx(.04 * i));
-    CHECK(poses.objects[0].valid == (i <= 12));
-    CHECK(poses.objects[0].cameras == 0);
+    CHECK(block.age == Approx(.04 * i));
+    CHECK(block.valid == (i <= 12));
+    CHECK(block.cameras == 0);
+    if (i <= 12) {
+      CHECK(block.covariance[15] > sigma);
+      CHECK(block.covariance[0] > sigma_angle);
+      Matrix6d C;
+      for (int row = 0, n = 0; row < 6; ++row) {
+        for (int col = row; col < 6; ++col) C(row, col) = C(col, row) = block.covariance[n++];
+      }
+      Vector6d e;
+      e << LogSO3(world.block.q * block.X_WO.q.conjugate()), world.block.p - block.X_WO.p;
+      CHECK(e.dot(C.ldlt().solve(e)) < 12.592);
+      if (moves) {
+        CHECK(Millimetres(block, world.block) < .6 * Millimetres(last, world.block));
+        CHECK(Degrees(block, world.block) < .8 * Degrees(last, world.block));
+      } else {
+        CHECK(Millimetres(block, world.block) < 4);
+        CHECK(Degrees(block, world.block) < 2);
+      }
+      at_end = block.X_WO;
+    } else {
+      CHECK((block.X_WO.p - at_end.p).norm() < .005);  // it stays where it was foretold last
+    }
+    sigma = block.covariance[15];
+    sigma_angle = block.covariance[0];
   }
-  for (int i = 21; i < 29; ++i)
-    pipeline.Process(world.See(), i + 1, i * kFrameUs, poses, seen);  // found again
-  CHECK(poses.objects[0].valid);
-  CHECK(poses.objects[0].age == 0);
+  if (moves) return;
+  for (int i = 21; i < 29; ++i, t += kFrameUs) pipeline.Process(world.See(), i + 8, t, poses, seen);
+  CHECK(block.valid);  // found again
+  CHECK(block.age == 0);
 }
 
 TEST_CASE("Frames without tags give invalid objects with a null pose, never a guess") {
@@ -302,11 +340,50 @@ TEST_CASE("With the whole run in view, poses are at least as many and none is wo
     const TrackedObject &a = causal[i].objects[0], &b = revised[i].objects[0];
     if (a.age == 0) CHECK(b.age == 0);
     CHECK((b.age > 0) == (i == 6));
-    if (b.age == 0) CHECK(Millimetres(b, truth[i]) < 6);  // one camera alone in some of them
+    CHECK(b.valid);
+    CHECK(Millimetres(b, truth[i]) < 6);  // one camera alone in some of them, none at all in one
+    if (b.age > 0) {
+      CHECK(b.cameras == 0);
+      CHECK(b.covariance[15] > revised[i - 1].objects[0].covariance[15]);
+      CHECK(b.covariance[0] > revised[i - 1].objects[0].covariance[0]);
+    }
     CHECK(revised[i].objects[1].valid);
     CHECK(revised[i].objects[2].id == -1);
   }
   CHECK(Pipeline(world.config).Revised().empty());
+}
+
+TEST_CASE("With the whole run in view a gap of half a second is filled from both sides, a longer one never") {
+  const bool longer = GENERATE(false, true);
+  World world;
+  Pipeline pipeline(world.config, {.revisable = true});
+  ObjectPoses poses;
+  CameraDetections seen;
+  std::vector<ObjectPoses> causal;
+  std::vector<Pose> truth;
+  const int first = 8, n = longer ? 12 : 11, frames = 30;  // 13 and 12 steps of 40 ms between the poses
+  for (int i = 0; i < frames; ++i) {
+    const double x = i / (frames - 1.);  // a reach
+    world.block.p = Eigen::Vector3d(.28, -.12 + .25 * x * x * x * (10 - 15 * x + 6 * x * x), .022);
+    truth.push_back(world.block);
+    const bool hidden = (i >= first && i < first + n) || i == frames - 1;
+    pipeline.Process(world.See(hidden ? Scene{} : world.Tags()), i + 1, i * kFrameUs, poses, seen);
+    causal.push_back(poses);
+  }
+  const auto revised = pipeline.Revised();
+  double filled = 0, foretold = 0;
+  for (int i = first; i < first + n; ++i) {
+    INFO("frame " << i);
+    const TrackedObject& o = revised[i].objects[0];
+    CHECK(o.valid == !longer);
+    CHECK(o.age == Approx(.04 * (i - first + 1)));
+    filled = std::max(filled, Millimetres(o, truth[i]));
+    foretold = std::max(foretold, Millimetres(causal[i].objects[0], truth[i]));
+    if (!longer) CHECK((o.X_WO.p - truth[i].p).norm() < 3 * std::sqrt(3 * o.covariance[15]));
+  }
+  CAPTURE(filled, foretold);
+  if (!longer) CHECK(filled < .25 * foretold);
+  CHECK_FALSE(revised.back().objects[0].valid);  // what comes after it is not known
 }
 
 TEST_CASE("Images that do not fit the configuration are refused with the sizes") {
