@@ -17,6 +17,7 @@ from intabs.errors import UserError
 from intabs.processes import Processes, free_ports, shared_memory_name, terminated_like_interrupted
 
 WEIGHTS = "lite6"
+CAMERAS = ("left", "right")  # of the plant that perception sees
 SUBGOALS = {"pick_place": ("grasped", "lifted", "placed")}
 SETTLE_S = 2.0  # after the plan's end: so long may success take to show
 TICK_S = 0.04  # policy
@@ -71,11 +72,12 @@ class _Run:
     """What is heard during one run. All decisions use the plant's clock, so in lockstep they fall the same way each
     time however late a message comes to us."""
 
-    def __init__(self, plan_id: int, lockstep: bool):
-        self.plan_id, self.lockstep = plan_id, lockstep
+    def __init__(self, plan_id: int, lockstep: bool, by_time: bool):
+        """by_time: frames are known by their exposure, as nobody tells perception the plant's count of them."""
+        self.plan_id, self.lockstep, self.by_time = plan_id, lockstep, by_time
         self.spoke = time.monotonic()  # the plant, by our clock
-        self.truth: dict[int, messages.plant_truth_t] = {}  # by frame_seq
-        self.poses: dict[int, messages.object_poses_t] = {}  # by frame_seq
+        self.truth: dict[int, messages.plant_truth_t] = {}  # by frame
+        self.poses: dict[int, messages.object_poses_t] = {}  # by frame
         self.skill: messages.skill_status_t | None = None
         self.skill_utimes: list[int] = []
         self.finished_us: int | None = None
@@ -84,10 +86,10 @@ class _Run:
 
     def on_truth(self, m) -> None:
         self.spoke = time.monotonic()
-        self.truth[m.frame_seq] = m
+        self.truth[m.utime if self.by_time else m.frame_seq] = m
 
     def on_poses(self, m) -> None:
-        self.poses[m.frame_seq] = m
+        self.poses[m.exposure_utime if self.by_time else m.frame_seq] = m
 
     def on_skill(self, m) -> None:
         if m.plan_id != self.plan_id or m.end_reason < RUNNING:
@@ -144,8 +146,8 @@ class _Run:
     def object_errors_mm(self, end_us: int) -> list[float]:
         """Distance of each valid pose from the truth of the same frame."""
         errors = []
-        for seq, poses in self.poses.items():
-            truth = self.truth.get(seq)
+        for frame, poses in self.poses.items():
+            truth = self.truth.get(frame)
             if truth is None or not self.start_us <= truth.utime <= end_us:
                 continue
             for slot in range(len(poses.id)):
@@ -169,8 +171,9 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
         stale.unlink(missing_ok=True)
 
     url, ring = bus.private_url(), shared_memory_name()
-    run = _Run(random.SystemRandom().getrandbits(62) + 1, options.clock == "lockstep")
-    limit_s = sum(s["max_ticks"] for s in skills) * TICK_S + 5.0
+    run = _Run(random.SystemRandom().getrandbits(62) + 1, options.clock == "lockstep", options.arm == "lite6")
+    # By the wall clock the arm holds while perception is behind.
+    limit_s = sum(s["max_ticks"] for s in skills) * TICK_S + (5.0 if options.clock == "lockstep" else 60.0)
     with terminated_like_interrupted(), Processes(out / "logs") as processes:
         listener = bus.Bus(url)
         listener.subscribe("PLANT_TRUTH", run.on_truth)
@@ -211,7 +214,13 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
         if options.perception == "tags":
             processes.start(
                 programs["perception"],
-                *("--lcm", url, "--ring", ring, "--config", paths.MODELS / "config" / "perception.yaml"),
+                *("--lcm", url, "--config", paths.MODELS / "config" / "perception.yaml"),
+                # A real arm's driver knows nothing of frames: then cameras are looked at as they come.
+                *(
+                    (w for camera in CAMERAS for w in ("--source", f"{camera}=ring:{ring}"))
+                    if options.arm == "lite6"
+                    else ("--ring", ring)
+                ),
                 *("--json", figures["perception"]),
             )
         processes.start(

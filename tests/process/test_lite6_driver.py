@@ -3,6 +3,8 @@ RESET; nothing needs a restart."""
 
 import json
 import math
+import os
+import pty
 import signal
 import subprocess
 import sys
@@ -17,6 +19,7 @@ from lite6_bench import (
     HOME,
     IDLE,
     LINK,
+    OVERRUN,
     SLOWING,
     STALE_COMMAND,
     STALE_STATUS,
@@ -110,6 +113,7 @@ def test_a_session_is_obeyed_and_far_targets_are_approached_slowly(bench):
 FAULTS = {
     "delay 200": ({SLOWING, HOLDING}, 0, True),
     "silence 200": ({SLOWING, HOLDING}, 0, True),
+    "mute 200": ({SLOWING, HOLDING}, 0, True),
     "corrupt 3": ({SLOWING, HOLDING}, 0, True),
     "drop reports": ({SLOWING, HOLDING}, 0, True),
     "drop": ({FAULT}, LINK, False),
@@ -162,14 +166,55 @@ def test_the_emergency_button_outlasts_a_reset_that_comes_too_early(moving):
     assert bench.status.vendor_error == 0
 
 
-def test_estop_by_message_stops_the_controller_too(moving):
+@pytest.mark.parametrize("by", ["message", "signal"])
+def test_estop_stops_the_controller_too(moving, by):
     bench = moving
-    bench.estop()
+    if by == "message":
+        bench.estop()
+    else:
+        bench.processes.running["intabs_lite6"].send_signal(signal.SIGUSR1)
     bench.until(lambda: bench.state == STOPPED, "stopped")
     assert bench.status.fault == ESTOP
     bench.until(lambda: bench.fake.state["state"] == 4, "the controller is stopped")
     bench.listen(0.3)
     assert bench.state == STOPPED
+    reset_until_it_goes_on(bench)
+
+
+def test_the_space_bar_stops(bench):
+    arguments = (
+        "--host",
+        "127.0.0.1",
+        "--port",
+        bench.fake.port,
+        "--report-port",
+        bench.fake.reports,
+        "--lcm",
+        bench.url,
+    )
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execv(paths.program("intabs_lite6"), ["intabs_lite6", *map(str, arguments), "--flight", str(bench.folder)])
+    try:
+        bench.session(path=swing)
+        bench.until(lambda: bench.statuses and bench.state == TRACKING and speed(bench.status) > 0.1, "the arm moves")
+        os.write(terminal, b" ")
+        bench.until(lambda: bench.state == STOPPED, "stopped")
+        assert bench.status.fault == ESTOP
+    finally:
+        os.kill(pid, signal.SIGINT)
+        os.close(terminal)
+        assert os.waitpid(pid, 0)[1] in (0, signal.SIGHUP)
+
+
+def test_a_loop_that_stood_still_is_a_fault(moving):
+    bench = moving
+    driver = bench.processes.running["intabs_lite6"]
+    driver.send_signal(signal.SIGSTOP)
+    time.sleep(0.3)
+    driver.send_signal(signal.SIGCONT)
+    bench.until(lambda: bench.state == FAULT, "fault")
+    assert bench.status.fault == OVERRUN
     reset_until_it_goes_on(bench)
 
 
@@ -223,7 +268,7 @@ junk = [rng.randbytes(n) for n in (0, 8, 40, 400)]
 channels = ["LITE6_COMMAND", "ESTOP", "RESET", "LITE6_STATUS"]
 begin, n = time.monotonic(), 0
 while time.monotonic() - begin < seconds:
-    ahead = n / 1e5 - (time.monotonic() - begin)
+    ahead = n / 5e4 - (time.monotonic() - begin)
     if ahead > 0.001:
         time.sleep(0.001)
         continue
@@ -236,11 +281,13 @@ print(n / seconds)
 
 def test_a_flood_of_garbage(moving):
     bench = moving
-    flood = subprocess.Popen([sys.executable, "-c", FLOOD, bench.url, "3"], stdout=subprocess.PIPE, text=True)
+    sender = [sys.executable, "-c", FLOOD, bench.url, "3"]
+    floods = [subprocess.Popen(sender, stdout=subprocess.PIPE, text=True) for _ in range(2)]
     begun = len(bench.statuses)
-    while flood.poll() is None:
+    while any(f.poll() is None for f in floods):
         bench.listen(0.1)
-    print("datagrams/s:", flood.communicate()[0])
+    print("datagrams/s:", sum(float(f.communicate()[0]) for f in floods))
+    print("states:", bench.states_since(begun), "counted:", bench.status.refused[0])
     assert not {FAULT, STOPPED} & set(bench.states_since(begun)) or bench.status.fault == STALE_COMMAND
     bench.listen(0.2)
     assert bench.status.refused[0] > 0

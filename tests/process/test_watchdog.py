@@ -5,11 +5,12 @@ import signal
 
 import pytest
 
-from bench import FAULT, HOLDING, SLOWING, STALE_COMMAND, TRACKING, Bench, need_programs
+from bench import FAULT, HOLDING, SLOWING, STALE_COMMAND, STOPPED, TRACKING, Bench, need_programs
 from intabs import messages
 
 need_programs()
-STALE_POSES = 4  # skills/skill_player.h EndReason
+RUNNING, STALE_POSES = 1, 4  # skills/skill_player.h EndReason
+ESTOP = 2  # Fault
 
 
 @pytest.fixture
@@ -89,8 +90,8 @@ def test_perception_killed_in_mid_motion_then_a_new_one_takes_over(moving):
     killed_at = len(bench.heard["LITE6_STATUS"])
     kill(bench.processes.running.pop("intabs_perception"))
     bench.until(lambda: bench.status.state == HOLDING, "the arm holds", patience_s=5)
-    assert bench.heard["SKILL_STATUS"][-1].end_reason == STALE_POSES
     assert_slowed_down_and_holds(bench, killed_at)
+    bench.until(lambda: bench.heard["SKILL_STATUS"][-1].end_reason == STALE_POSES, "the plan ends", patience_s=10)
     assert "perception" in bench.processes.last_line("intabs_control")
 
     old_session = bench.status.session
@@ -101,3 +102,32 @@ def test_perception_killed_in_mid_motion_then_a_new_one_takes_over(moving):
     bench.play(plan_id=2)
     bench.until(lambda: bench.status.state == TRACKING, "the new session is obeyed")
     assert bench.status.session not in (0, old_session)
+
+
+def test_perception_that_is_late_makes_the_arm_wait_then_the_plan_goes_on(moving):
+    bench = moving
+    stopped_at = len(bench.heard["LITE6_STATUS"])
+    perception = bench.processes.running["intabs_perception"]
+    perception.send_signal(signal.SIGSTOP)
+    bench.until(lambda: bench.status.state == HOLDING, "the arm holds", patience_s=5)
+    perception.send_signal(signal.SIGCONT)
+    bench.until(lambda: bench.status.state == TRACKING and speed(bench.status) > 0.1, "the arm moves again")
+    assert bench.heard["SKILL_STATUS"][-1].end_reason == RUNNING
+    assert FAULT not in bench.states_since(stopped_at)
+
+
+def test_a_signal_stops_the_plant_until_a_reset(moving):
+    bench = moving
+    session = bench.status.session
+    bench.processes.running["intabs_plant"].send_signal(signal.SIGUSR1)
+    bench.until(lambda: bench.status.state == STOPPED, "stopped", patience_s=5)
+    assert bench.status.fault == ESTOP
+    bench.listen(0.5)
+    assert bench.status.state == STOPPED
+    held = bench.status.q_commanded
+    bench.listen(0.2)
+    assert bench.status.q_commanded == held
+    reset = messages.reset_t()
+    reset.session = session
+    bench.bus.publish("RESET", reset)
+    bench.until(lambda: bench.status.state == HOLDING, "the reset ends it")

@@ -10,25 +10,28 @@
 #include <string>
 
 #include "intabs/core/pose.h"
+#include "intabs/core/text.h"
 
 namespace intabs {
 
 // Throws std::runtime_error, one line with file and key. Identity where the file says nothing of it.
-inline Pose LoadHandEye(const std::string& file) {
+// `named`: by another file's `calibration`; such a file names no third one (it might be itself).
+inline Pose LoadHandEye(const std::string& file, bool named = false) {
+  const auto fail = [](const std::string& what) { throw std::runtime_error(OneLine(what)); };
   YAML::Node root;
   try {
     root = YAML::LoadFile(file);
   } catch (const YAML::BadFile&) {
-    throw std::runtime_error(file + ": cannot be read");
+    fail(file + ": cannot be read");
   } catch (const YAML::Exception& e) {
-    throw std::runtime_error(file + ": not readable as YAML: line " + std::to_string(e.mark.line + 1) + ": " +
-                             e.msg);
+    fail(file + ": not readable as YAML: line " + std::to_string(e.mark.line + 1) + ": " + e.msg);
   }
-  if (!root.IsMap()) throw std::runtime_error(file + ": expected a map of values");
+  if (!root.IsMap()) fail(file + ": expected a map of values");
   if (const YAML::Node other = root["calibration"]) {
-    if (!other.IsScalar()) throw std::runtime_error(file + ": calibration: expected a file name");
+    if (!other.IsScalar()) fail(file + ": calibration: expected a file name");
+    if (named) fail(file + ": calibration: this file is one itself; take the line out");
     const std::string name = other.Scalar();
-    return LoadHandEye(name.starts_with('/') ? name : file.substr(0, file.rfind('/') + 1) + name);
+    return LoadHandEye(name.starts_with('/') ? name : file.substr(0, file.rfind('/') + 1) + name, true);
   }
   const YAML::Node node = root["X_WB"];
   if (!node) return {};
@@ -36,12 +39,12 @@ inline Pose LoadHandEye(const std::string& file) {
     const YAML::Node list = node.IsMap() ? node[key] : YAML::Node();
     const std::string where =
         file + ": X_WB." + key + ": expected " + std::to_string(out.size()) + " numbers";
-    if (!list || !list.IsSequence() || list.size() != out.size()) throw std::runtime_error(where);
+    if (!list || !list.IsSequence() || list.size() != out.size()) fail(where);
     for (size_t i = 0; i < out.size(); ++i) {
       try {
         out[i] = list[i].as<double>();
       } catch (const YAML::Exception&) {
-        throw std::runtime_error(where);
+        fail(where);
       }
     }
   };
@@ -51,7 +54,7 @@ inline Pose LoadHandEye(const std::string& file) {
   numbers("q", q);
   const Eigen::Quaterniond rotation(q[0], q[1], q[2], q[3]);
   if (!(std::abs(rotation.norm() - 1) < 1e-3))
-    throw std::runtime_error(file + ": X_WB.q: (w x y z) has not norm 1");
+    fail(file + ": X_WB.q: (w x y z) has not norm 1");
   return {{p[0], p[1], p[2]}, rotation.normalized()};
 }
 

@@ -13,6 +13,8 @@
 #include <string>
 #include <vector>
 
+#include "intabs/core/text.h"
+
 namespace intabs {
 
 class YamlConfig : public CLI::Config {
@@ -71,9 +73,9 @@ class YamlConfig : public CLI::Config {
       const bool given = std::any_of(argv + 1, argv + argc, [&](const std::string& a) {
         return a == option || a.starts_with(option + "=");
       });
-      if (!given) return File() + ": key \"" + key + "\": " + what;
+      if (!given) return OneLine(File() + ": key \"" + key + "\": " + what);
     }
-    return what;
+    return OneLine(what);
   }
 
  private:

@@ -15,6 +15,7 @@
 #include "intabs/rt/stop_signal.h"
 #include "intabs/rt/tick_stats.h"
 #include "intabs/skills/skill_controller.h"
+#include "plan_receiver.h"
 
 namespace intabs {
 namespace {
@@ -36,42 +37,12 @@ const char* Describe(EndReason reason) {
   switch (reason) {
     case EndReason::kFinished: return "finished";
     case EndReason::kAborted: return "aborted";
-    case EndReason::kStalePoses: return "object poses are older than 0.5 s: is perception running?";
+    case EndReason::kStalePoses: return "object poses are older than 2.5 s: is perception running?";
     case EndReason::kBadInput: return "a reading or the policy's output is not finite";
     case EndReason::kRefused: return "the driver is in fault, stopped, or obeys another session";
     default: return "";
   }
 }
-
-// Collects the parts of a plan. A plan that is complete and new starts; parts of a running one are ignored.
-class PlanReceiver {
- public:
-  // True when `plan` has become complete.
-  bool Add(const SkillPlan& m) {
-    constexpr int kMaxParts = (kMaxSkills + kMaxSkillsPerPart - 1) / kMaxSkillsPerPart;
-    if (m.plan_id <= 0 || m.parts < 1 || m.parts > kMaxParts || m.part < 0 || m.part >= m.parts) return false;
-    if (m.plan_id != id_ || static_cast<int>(parts_.size()) != m.parts) {
-      id_ = m.plan_id;
-      parts_.assign(m.parts, std::nullopt);
-    }
-    parts_[m.part] = m;
-    skills_.clear();
-    for (const auto& part : parts_) {
-      if (!part) return false;
-      for (int i = 0; i < part->n; ++i) {
-        skills_.push_back({part->skills[i].z, part->skills[i].min_ticks, part->skills[i].max_ticks});
-      }
-    }
-    return true;
-  }
-  int64_t id() const { return id_; }
-  const std::vector<Skill>& skills() const { return skills_; }
-
- private:
-  int64_t id_ = 0;
-  std::vector<std::optional<SkillPlan>> parts_;
-  std::vector<Skill> skills_;
-};
 
 class Control {
  public:

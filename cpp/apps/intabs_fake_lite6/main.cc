@@ -1,4 +1,6 @@
 // intabs_fake_lite6: a Lite 6 controller to test against, with nothing, or a MuJoCo world, behind it.
+#include <pthread.h>
+
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cstdio>
@@ -22,6 +24,8 @@ namespace {
 using lite6::FakeArm;
 using lite6::FakeController;
 using lite6::FakeOptions;
+
+constexpr int kPriority = 77;  // below the driver's threads
 
 struct Options {
   FakeOptions fake;
@@ -76,6 +80,11 @@ void Run(const Options& o) {
   }
   FakeController fake(o.fake, World::Home(), tick);
   std::fprintf(stderr, "controller on 127.0.0.1:%d, reports from %d\n", fake.port(), fake.report_port_base());
+  // A real controller does not wait for our CPUs; where this is not allowed, the fake may. Only this thread: pictures
+  // take what is left.
+  sched_param priority{};
+  priority.sched_priority = kPriority;
+  (void)pthread_setschedparam(pthread_self(), SCHED_FIFO, &priority);
   fake.Run(StopRequested);
   if (body) body->Close();
   if (o.json.empty()) return;

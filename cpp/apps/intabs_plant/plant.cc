@@ -7,6 +7,7 @@
 #include <random>
 #include <stdexcept>
 
+#include "intabs/rt/estop_input.h"
 #include "intabs/rt/periodic.h"
 #include "intabs/rt/stop_signal.h"
 
@@ -48,6 +49,7 @@ Plant::Plant(const PlantOptions& options)
     sim_.controller().Estop();
   });
   bus_.Subscribe(kReset, [this](const Reset& r) { sim_.controller().ResetFault(r.session); });
+  InstallEstopSignal();
 
   for (const int64_t begin = MonotonicUs(); MonotonicUs() - begin < kListenUs && !StopRequested();)
     Handle(50);
@@ -192,6 +194,7 @@ void Plant::OnControl(const PlantControl& c) {
 
 void Plant::Handle(int timeout_ms) {
   if (bus_.Handle(timeout_ms) < 0) throw std::runtime_error("LCM is broken on " + options_.lcm);
+  if (TakeEstopSignal()) sim_.controller().Estop();
   if (heard_other_) {
     throw std::runtime_error("another plant or driver speaks on LITE6_STATUS at " + options_.lcm +
                              ": stop it, or give this one another --lcm or a --prefix");

@@ -30,6 +30,7 @@ class Painter {
       renderer_.emplace(world, kWidth, kHeight);
     if (options.cameras) {
       for (const std::string& name : kCameras) cameras_.push_back(renderer_->FindCamera(name));
+      pictures_.assign(cameras_.size(), rgb_);
       ring_.emplace(options.ring, kCameras, kWidth, kHeight);
     }
     if (!options.video.empty() || !options.strip.empty()) film_camera_ = renderer_->FindCamera(kFilmCamera);
@@ -39,10 +40,10 @@ class Painter {
   }
 
   void PaintFrames(const Snapshot& snapshot, int64_t frame_seq, int64_t exposure_us) {
-    for (size_t i = 0; i < cameras_.size(); ++i) {
-      renderer_->Render(snapshot, cameras_[i], rgb_.data());
-      ring_->Write(static_cast<int>(i), frame_seq, exposure_us, rgb_.data());
-    }
+    for (size_t i = 0; i < cameras_.size(); ++i) renderer_->Render(snapshot, cameras_[i], pictures_[i].data());
+    // Together, as cameras that are triggered together deliver them.
+    for (size_t i = 0; i < cameras_.size(); ++i)
+      ring_->Write(static_cast<int>(i), frame_seq, exposure_us, pictures_[i].data());
   }
 
   void PaintFilm(const Snapshot& snapshot, int64_t frame_seq) {
@@ -69,7 +70,8 @@ class Painter {
   std::optional<PictureStrip> strip_;
   std::optional<Viewer> viewer_;
   int64_t filmed_seq_ = 0;
-  std::vector<uint8_t> rgb_;
+  std::vector<std::vector<uint8_t>> pictures_;  // of the cameras
+  std::vector<uint8_t> rgb_;                    // of the film
 };
 
 std::unique_ptr<View> View::Make(const World& world, const PlantOptions& options) {

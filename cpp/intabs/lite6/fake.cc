@@ -88,13 +88,16 @@ void FakeController::Run(const std::function<bool()>& stop) {
   next_corrupt_us_ = AfterSeconds(due_us, options_.corrupt_every_s);
   std::vector<pollfd> fds;
   while (!stop()) {
-    fds.clear();
-    for (const Listener& l : listeners_) fds.push_back({l.fd, POLLIN, 0});
-    const bool deaf = MonotonicUs() < std::max(deaf_until_us_, mute_until_us_);
-    for (const auto& c : connections_) {
-      // A deaf controller leaves the requests in the socket.
-      const bool listens = !(deaf && c->kind == Kind::kControl);
-      fds.push_back({c->fd, static_cast<short>(listens ? POLLIN : 0), 0});
+    {
+      const std::lock_guard lock(mutex_);
+      fds.clear();
+      for (const Listener& l : listeners_) fds.push_back({l.fd, POLLIN, 0});
+      const bool deaf = MonotonicUs() < std::max(deaf_until_us_, mute_until_us_);
+      for (const auto& c : connections_) {
+        // A deaf controller leaves the requests in the socket.
+        const bool listens = !(deaf && c->kind == Kind::kControl);
+        fds.push_back({c->fd, static_cast<short>(listens ? POLLIN : 0), 0});
+      }
     }
     const int64_t wait_us = std::max<int64_t>(due_us - MonotonicUs(), 0);
     const timespec timeout{wait_us / 1000000, (wait_us % 1000000) * 1000};
@@ -197,7 +200,7 @@ bool FakeController::ServeOrders(Connection& c) {
 }
 
 void FakeController::SendReports() {
-  if (now_us_ < mute_until_us_) return;
+  if (now_us_ < std::max(mute_until_us_, unreported_until_us_)) return;
   uint8_t report[kMaxReportBytes];
   for (const auto& c : connections_) {
     ReportKind kind;
@@ -306,6 +309,10 @@ std::string FakeController::Execute(const std::string& line) {
       deaf_until_us_ = now_us_ + n * int64_t{1000};
       return done;
     }
+    if (verb == "mute") {
+      unreported_until_us_ = now_us_ + n * int64_t{1000};
+      return done;
+    }
     if (verb == "silence") {
       mute_until_us_ = now_us_ + n * int64_t{1000};
       return done;
@@ -328,7 +335,7 @@ std::string FakeController::Execute(const std::string& line) {
       return done;
     }
   }
-  return R"({"error": "orders: delay MS, silence MS, drop [reports], unplug S, corrupt N, garble, error N, warning N, )"
+  return R"({"error": "orders: delay MS, silence MS, mute MS, drop [reports], unplug S, corrupt N, garble, error N, warning N, )"
          R"(estop on|off, guide Q1 .. Q6, state"})";
 }
 

@@ -40,6 +40,7 @@ class FakeController {
 
   // One order as a line of text; the answer is one line of JSON, with "error" if it was not understood. From any thread.
   //   delay MS       no request is answered for so long      silence MS     nothing is sent at all for so long
+  //   mute MS        no report is sent for so long
   //   drop           closes all connections                  drop reports   closes the report connections
   //   unplug S       closes all and refuses new ones         corrupt N      the next N reports are damaged
   //   garble         the next reply is of nothing asked      error CODE, warning CODE
@@ -84,7 +85,7 @@ class FakeController {
   std::array<int, 4> report_ports_{};  // by port number: full, normal, rich, real
 
   int64_t tick_ = 0, now_us_ = 0;
-  int64_t deaf_until_us_ = 0, mute_until_us_ = 0, unplugged_until_us_ = 0;
+  int64_t deaf_until_us_ = 0, mute_until_us_ = 0, unreported_until_us_ = 0, unplugged_until_us_ = 0;
   int64_t next_delay_us_ = 0, next_drop_us_ = 0, next_corrupt_us_ = 0;
   int corrupt_ = 0;
   bool garble_ = false;

@@ -126,7 +126,7 @@ TEST_CASE("It holds the pose it found, then follows a session") {
 }
 
 TEST_CASE("Whatever breaks, no tick that knows of it moves on; after a RESET, or alone, it goes on") {
-  for (const std::string order : {"delay 200", "silence 300", "corrupt 1", "corrupt 2", "corrupt 3", "drop reports",
+  for (const std::string order : {"delay 200", "silence 300", "mute 300", "corrupt 1", "corrupt 2", "corrupt 3", "drop reports",
                                   "drop", "garble", "error 31"}) {
     INFO(order);
     Rig rig;
@@ -145,6 +145,20 @@ TEST_CASE("Whatever breaks, no tick that knows of it moves on; after a RESET, or
   }
 }
 
+TEST_CASE("Answers or reports that stay away make the arm hold before they are back") {
+  for (const std::string verb : {"delay", "mute"}) {
+    INFO(verb);
+    Rig rig;
+    rig.session = 7;
+    rig.UntilItMoves();
+    const int64_t back_us = MonotonicUs() + 1'500'000;
+    rig.controller.fake.Order(verb + " 1500");
+    rig.Until([&] { return rig.status.state == ArmState::kHolding || MonotonicUs() > back_us; });
+    CHECK(MonotonicUs() < back_us);
+    rig.UntilItMoves();
+  }
+}
+
 TEST_CASE("The vendor's error is in the status, with its name in the log") {
   Rig rig;
   rig.session = 7;
@@ -154,6 +168,18 @@ TEST_CASE("The vendor's error is in the status, with its name in the log") {
   CHECK(rig.status.fault == Fault::kVendor);
   CHECK(rig.status.vendor_error == 60);
   CHECK(rig.Said("C60 linear speed"));
+}
+
+TEST_CASE("An ESTOP brakes the arm first, then stops the controller") {
+  Rig rig;
+  rig.session = 7;
+  rig.Until([&] { return rig.status.state == ArmState::kTracking && rig.status.dq.norm() > .35; });
+  rig.driver.Estop();
+  rig.Until([&] { return rig.driver.client().phase == Phase::kStopped; });
+  for (int i = 0; i < 50; ++i) rig.Tick();
+  CHECK(rig.status.state == ArmState::kStopped);
+  // It went all of the way that the reference braked on.
+  CHECK((rig.status.q - rig.status.q_commanded).cwiseAbs().maxCoeff() < 2e-4);
 }
 
 TEST_CASE("A controller that somebody else stops is noticed") {
