@@ -9,7 +9,7 @@ torch.set_num_threads(1)
 from scipy.spatial.transform import Rotation  # noqa: E402
 
 from intabs.evaluate.baselines import Mean, Pca, Still  # noqa: E402
-from intabs.evaluate.metrics import Motion, Scaling, errors, fixed_cuts  # noqa: E402
+from intabs.evaluate.metrics import Motion, Sample, Scaling, errors, fixed_cuts, sample  # noqa: E402
 
 
 def motion(seed: int, ticks: int = 40) -> Motion:
@@ -24,6 +24,10 @@ def motion(seed: int, ticks: int = 40) -> Motion:
     valid = np.zeros((ticks, 2), bool)
     valid[:, 0] = True
     return Motion(agent, p, R, np.zeros((ticks, 0)), valid)
+
+
+def of(m: Motion) -> Sample:
+    return Sample(m, None, None)
 
 
 @pytest.fixture
@@ -71,11 +75,11 @@ def test_poses_that_nobody_vouched_for_do_not_count(train):
 
 def test_still_stays_and_the_mean_of_equal_motions_is_that_motion(train):
     m = motion(3)
-    still = Still().reconstruct(m, [0, 39])
+    still = Still().reconstruct(of(m), [0, 39])
     assert (still.agent == m.agent[0]).all() and (still.p == m.p[0]).all()
     same = [m] * 3
     scaling = Scaling.fit(same)
-    assert errors(Mean(same, scaling, 40).reconstruct(m, [0, 20, 39]), m, scaling)["all"] < 0.01
+    assert errors(Mean(same, scaling, 40).reconstruct(of(m), [0, 20, 39]), m, scaling)["all"] < 0.01
 
 
 def test_pca_with_all_components_rebuilds_its_training_and_with_few_does_not(train):
@@ -83,43 +87,148 @@ def test_pca_with_all_components_rebuilds_its_training_and_with_few_does_not(tra
     m = train[2]
     cuts = fixed_cuts(len(m), 14)
     assert cuts == [0, 13, 26, 39]
-    exact = errors(Pca(train, scaling, 14, agent=36, environment=144).reconstruct(m, cuts), m, scaling)
-    coarse = errors(Pca(train, scaling, 14, agent=1, environment=1).reconstruct(m, cuts), m, scaling)
+    exact = errors(Pca(train, scaling, 14, agent=36, environment=144).reconstruct(of(m), cuts), m, scaling)
+    coarse = errors(Pca(train, scaling, 14, agent=1, environment=1).reconstruct(of(m), cuts), m, scaling)
     assert exact["all"] < 5e-3 < 5e-2 < coarse["all"]
 
 
-def test_a_policy_that_does_nothing_is_still(train):
-    from intabs import _core
+def lite6_demo(ticks=30, seed=0):
+    """Joints at random, one object at rest."""
     from intabs.data.demos import Demo
-    from intabs.data.features import Normalizer
-    from intabs.evaluate.evaluate import sample
-    from intabs.evaluate.learned import Learned
-    from intabs.model.networks import InteractionAbstractions
 
-    ticks, rng = 30, np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     pose = np.zeros((ticks, 4, 7))
     pose[..., 3] = 1
     pose[:, 0, :3] = rng.normal(size=3)
     valid = np.zeros((ticks, 4), bool)
     valid[:, 0] = True
     q = np.cumsum(rng.normal(size=(ticks, 6)) * 0.02, 0)
-    demo = Demo(
+    return Demo(
         np.arange(ticks) * 0.04, q, q * 0, np.zeros(ticks), pose, valid, np.zeros((ticks, 7)), {"embodiment": "lite6"}
     )
-    arm = _core.ArmModel.lite6()
-    s = sample(demo, arm)
-    size = {"layers": 1, "hidden": 8, "input_linear": 8}
-    model = InteractionAbstractions({"pi": size, "encoder": size})
+
+
+def lite6_model(demo, kind="split"):
+    from intabs.model.networks import InteractionAbstractions
+    from intabs.model.space import state_of
+    from intabs.train.trainer import load_space
+
+    space = load_space([demo])
+    space.fit([state_of(demo)])
+    size = {"layers": 1, "hidden": 8, "input_linear": 8, "skip": True}
+    config = {"encoders": kind, "pi": size, "encoder": {**size, "pool": "mean"}, "eta": {**size, "skip": False}}
+    return InteractionAbstractions(config, space)
+
+
+def test_a_policy_that_does_nothing_is_still():
+    from intabs.evaluate.learned import Learned
+
+    demo = lite6_demo()
+    s = sample(demo)
+    model = lite6_model(demo)
     for head in model.pi.heads.values():
         torch.nn.init.zeros_(head.weight)
         torch.nn.init.zeros_(head.bias)
-    learned = Learned("intabs", model, Normalizer.fit([s.trajectory]), arm)
+    torch.nn.init.constant_(model.pi.heads["agent"].bias, -1.0)  # the gripper stays open; commands move nothing here
+    torch.nn.init.constant_(model.pi.heads["carried"].bias, -9.0)
+    learned = Learned("intabs", model)
     scaling = Scaling.fit([s.motion])
-    got = learned.reconstruct(s.motion, [0, 12, 29], s.trajectory)
-    assert len(got) == ticks
-    want = errors(Still().reconstruct(s.motion, [0, 29]), s.motion, scaling)
+    got = learned.reconstruct(s, [0, 12, 29])
+    assert len(got) == len(demo)
+    want = errors(Still().reconstruct(s, [0, 29]), s.motion, scaling)
     assert errors(got, s.motion, scaling) == pytest.approx(want, abs=1e-5)
-    torch.nn.init.constant_(model.pi.heads["agent"].bias, 1.0)
-    assert errors(learned.reconstruct(s.motion, [0, 12, 29], s.trajectory), s.motion, scaling)[
-        "joints"
-    ] != pytest.approx(want["joints"], abs=1e-3)
+    torch.nn.init.constant_(model.pi.heads["response"].bias, 1.0)
+    assert errors(learned.reconstruct(s, [0, 12, 29]), s.motion, scaling)["joints"] != pytest.approx(
+        want["joints"], abs=1e-3
+    )
+    # What is held moves with the arm, and only then.
+    at_rest = learned.reconstruct(s, [0, 29])
+    torch.nn.init.constant_(model.pi.heads["carried"].bias, 9.0)
+    held = learned.reconstruct(s, [0, 29])
+    assert np.abs(at_rest.p[-1, 0] - s.motion.p[0, 0]).max() < 1e-5
+    assert np.abs(held.p[-1, 0] - s.motion.p[0, 0]).max() > 0.01
+
+
+def test_a_held_object_keeps_its_place_in_the_tips_frame():
+    from intabs.model.space import state_of
+
+    demo = lite6_demo()
+    space = lite6_model(demo).space
+    state, _ = state_of(demo)
+    now, tip = space.features(state[:1])
+    del now
+    response = torch.full((1, 6), 0.02)
+    carried = space.carried(state[:1], tip, state.agent[:1, :6] + response)
+    after = space.move(state[:1], tip, response, carried, state.agent[:1, 6])
+    (p0, R0), (p1, R1) = tip, space.arm.tip(after.agent[:, :6])
+    before = R0.transpose(-1, -2) @ (state.p[0, 0] - p0[0])
+    np.testing.assert_allclose((R1.transpose(-1, -2) @ (after.p[0, 0] - p1[0])).numpy(), before.numpy(), atol=2e-4)
+
+
+def test_slots_without_an_object_do_not_change_z():
+    from intabs.evaluate.learned import Learned
+
+    demo = lite6_demo()
+    learned = Learned("intabs", lite6_model(demo))
+    pieces = [(0, 12), (12, 29)]
+    want = learned.encode(learned.inputs(sample(demo)), pieces)
+    demo.object_pose[:, 2:, :3] = 5.0  # nonsense where nothing is valid
+    torch.testing.assert_close(learned.encode(learned.inputs(sample(demo)), pieces), want)
+    demo.object_pose[:, 0, :3] += 0.5
+    assert not torch.allclose(learned.encode(learned.inputs(sample(demo)), pieces), want)
+
+
+@pytest.mark.parametrize("make", ["FaithfulHdmp", "Hdmp"])
+def test_movement_primitives_come_close_to_the_motion_they_are_fitted_to(train, make):
+    from intabs.evaluate import hdmp
+
+    if make == "Hdmp" and not hdmp.Hdmp.installed():
+        pytest.skip("movement-primitives is not installed")
+    scaling = Scaling.fit(train)
+    m = motion(5, 80)
+    got = errors(getattr(hdmp, make)().reconstruct(of(m), [0, 40, 79]), m, scaling)
+    assert got["all"] < 0.3 * errors(Still().reconstruct(of(m), [0, 79]), m, scaling)["all"]
+
+
+def test_neighbours_vote_and_the_nearer_decides_a_tie():
+    from intabs.evaluate.knn import confusion, label_pieces, neighbours
+
+    base = np.array([[0.0], [0.1], [1.0], [1.1], [1.2]])
+    labels = np.array([0, 0, 1, 1, 1])
+    assert neighbours(base, labels, np.array([[0.02], [1.05]]), k=3).tolist() == [0, 1]
+    assert neighbours(base, labels, np.array([[0.4]]), k=4).tolist() == [0]
+    assert label_pieces(np.array([3] * 5 + [1] * 2 + [2] * 6)) == [(0, 5, 3), (7, 12, 2)]
+    assert confusion(np.array([0, 1, 1]), np.array([0, 1, 0]), 2).tolist() == [[1, 0], [1, 1]]
+
+
+def test_a_boundary_counts_once_and_within_three_frames():
+    from intabs.evaluate.boundaries import precision_recall_f1
+
+    assert precision_recall_f1([np.array([10, 12, 40])], [np.array([13, 60])]) == (1 / 3, 1 / 2, pytest.approx(0.4))
+
+
+def test_boundaries_are_found_where_a_motion_starts_and_stops():
+    """A tip that rests, moves, rests; Viterbi against the sum over all segmentations by brute force."""
+    import itertools
+
+    from intabs.train.boundaries import BoundaryConfig, SemiMarkov
+
+    rng = np.random.default_rng(0)
+    x = np.concatenate([np.zeros(10), np.ones(8), np.zeros(12)])[:, None] + 0.05 * rng.normal(size=(30, 1))
+    config = BoundaryConfig(penalty=0.3, shortest=4, longest=20, still=0.1)
+    assert SemiMarkov(x, config).viterbi().tolist() == [0, 10, 18]
+    x = rng.normal(size=(11, 2))
+    config = BoundaryConfig(penalty=1.0, shortest=2, longest=6, still=0.1)
+    model = SemiMarkov(x, config)
+
+    def price(cuts):
+        return sum(((x[a:b] - x[a:b].mean(0)) ** 2).sum() + 1.0 for a, b in zip(cuts, cuts[1:], strict=False))
+
+    every = [
+        (0, *inner, 11)
+        for n in range(6)
+        for inner in itertools.combinations(range(1, 11), n)
+        if all(2 <= b - a <= 6 for a, b in zip((0, *inner), (*inner, 11), strict=True))
+    ]
+    best = min(every, key=price)
+    assert tuple(model.viterbi()) == best[:-1]
