@@ -4,7 +4,9 @@
 
 #include <algorithm>
 #include <cstring>
+#include <mutex>
 #include <stdexcept>
+#include <utility>
 
 #include "intabs/plant/task.h"
 
@@ -18,10 +20,26 @@ constexpr int kPhysicsSteps = 2;      // a driver tick
 constexpr int kSettleSteps = 200;     // physics steps until beads lie still
 constexpr double kBeadGrid = 0.0105;  // [m], a little over a bead's diameter
 
+// MuJoCo 2.2.2's box against box: where they lie on each other at a distance of zero, as after a reset, rounding makes it
+// now and then report contacts half a metre deep, which throw the object. Nothing goes deeper into a box than it is thick.
+mjfCollision box_box = nullptr;
+int TrueBoxContacts(const mjModel* m, const mjData* d, mjContact* contacts, int g1, int g2, mjtNum margin) {
+  const mjtNum* a = m->geom_size + 3 * g1;
+  const mjtNum* b = m->geom_size + 3 * g2;
+  const mjtNum thickness = 2 * std::min({a[0], a[1], a[2], b[0], b[1], b[2]});
+  mjContact* end = contacts + box_box(m, d, contacts, g1, g2, margin);
+  return static_cast<int>(
+      std::remove_if(contacts, end, [&](const mjContact& c) { return c.dist < -thickness; }) - contacts);
+}
+
 // MuJoCo's own handlers write MUJOCO_LOG.TXT where they stand, and an error waits for the Enter key.
 void InstallHandlers() {
-  mju_user_warning = [](const char*) {};  // Step() looks at mjData::warning
-  mju_user_error = [](const char* text) { throw std::runtime_error(std::string("MuJoCo: ") + text); };
+  static std::once_flag once;
+  std::call_once(once, [] {
+    mju_user_warning = [](const char*) {};  // Step() looks at mjData::warning
+    mju_user_error = [](const char* text) { throw std::runtime_error(std::string("MuJoCo: ") + text); };
+    box_box = std::exchange(mjCOLLISIONFUNC[mjGEOM_BOX][mjGEOM_BOX], &TrueBoxContacts);
+  });
 }
 
 std::string ScenePath(const std::string& models_dir, const std::string& task) {

@@ -140,5 +140,5 @@ def resample(demo: Demo, rate_hz: float) -> Demo:
         actions=np.column_stack([step, actions[last, n:]]),
         attrs=demo.attrs | {"rate_hz": float(rate_hz), "source_rate_hz": round(rate, 3)},
         obs=obs,
-        extra={k: v[last] for k, v in demo.extra.items() if k == "labels"},
+        extra={k: v[last] for k, v in demo.extra.items() if k in ("labels", "filled")},
     )  # fmt: skip

@@ -4,6 +4,9 @@ A tick is 40 ms. States are the puppet's measured joints and what perception sai
 from the puppet's last target to where the master is now. A simulated master tells in its status what was meant
 (q_commanded, without the knocks the hand gets) and while it demonstrates (mode 1); a master guided by hand is taken as
 measured, from where it begins to move to where it comes to rest.
+
+Where perception did not see an object it foretold its pose, causally; who looks back knows better: short gaps are
+filled from both sides, long ones are invalid, and `filled` says where.
 """
 
 from __future__ import annotations
@@ -24,6 +27,7 @@ from intabs.errors import UserError
 TICK_US = 40000
 DRIVER_TICK_US = 4000
 SERVO = 1  # core/types.h ArmMode
+FILLED = 2  # perception/gaps.h SampleState
 STILL = 0.02  # rad: a master guided by hand moves when it is further than this from where it was
 MARGIN_TICKS = 5  # kept before and after its motion
 
@@ -189,20 +193,37 @@ def _from_first_poses(ticks: list) -> list:
 
 
 def _demo(ticks: list[tuple[Tick, np.ndarray]], attrs: dict) -> Demo:
-    pose, valid = [], []
+    pose, measured = [], []
+    before = None
     for t, _ in ticks:
-        p, v = objects_of(t.poses) if t.poses is not None else (pose[-1], np.zeros_like(valid[-1]))
+        p, valid = objects_of(t.poses) if t.poses is not None else (pose[-1], np.zeros_like(measured[-1]))
+        seen = np.array(t.poses.age) == 0 if hasattr(t.poses, "age") else True
         pose.append(p)
-        valid.append(v)
+        measured.append(valid & seen & (t.poses is not before))
+        before = t.poses
     statuses = [t.status for t, _ in ticks]
     time_us = np.array([t.utime for t, _ in ticks])
+    time = (time_us - time_us[0]) * 1e-6
+    pose, state = fill_gaps(time, np.array(pose), np.array(measured))
     return Demo(
-        time=(time_us - time_us[0]) * 1e-6,
+        time=time,
         joint_pos=np.array([s.q for s in statuses]),
         joint_vel=np.array([s.dq for s in statuses]),
         gripper=np.array([float(s.gripper_closed) for s in statuses]),
-        object_pose=np.array(pose),
-        object_valid=np.array(valid),
+        object_pose=pose,
+        object_valid=state > 0,
         actions=np.array([a for _, a in ticks]),
         attrs={"rate_hz": 1e6 / TICK_US, "embodiment": "lite6", **attrs},
+        extra={"filled": state == FILLED},
     )
+
+
+def fill_gaps(time: np.ndarray, pose: np.ndarray, measured: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gaps of up to 0.5 s between measurements, from both sides (perception/gaps.h); in longer ones, before the first
+    and after the last measurement poses stay as they are and count as invalid. time (T,) s; pose (T, S, 7); measured
+    (T, S). Returns the poses and (T, S) 0 invalid, 1 measured, 2 filled."""
+    pose = pose.copy()
+    state = np.zeros(measured.shape, np.uint8)
+    for i in np.flatnonzero(measured.any(0)):
+        pose[:, i], state[:, i], _ = _core.fill_gaps(time, pose[:, i], measured[:, i])
+    return pose, state
