@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from intabs.demonstrate.base import BOWL, CUP, FINE, LID, SLOW, Demonstrator, Leg, Placement, as_pose, gripper
+from intabs.demonstrate.base import BOWL, CUP, FINE, LID, SLOW, SPOON, Demonstrator, Leg, Placement, as_pose, gripper
 
 HANDLE = np.array([-0.050, 0.0, 0.048])  # where the tip holds it, in the cup's frame [m]
 PIVOT = np.array([0.0, 0.0, 0.036])  # of the turn, in the cup's frame [m]
@@ -124,7 +124,7 @@ class Pour(Demonstrator):
             return plan
 
         yaws = [self.side * y for y in (-0.8, -0.4, 0.8, 0.4, 0.0)]
-        if self.seen[LID]:  # the open box stands to the left of the bowl: the arm comes from the right
+        if self.seen[LID] or self.seen[SPOON]:  # box or rack on the left of the bowl: the arm comes from the right
             yaws = [0.8, 0.4, 0.6, 0.0]
         ways = [(np.radians(s), y, c) for c in (False, True) for s in (15, 25, 8, 35, 50) for y in yaws]
         return self.choose(q, ways, legs)
