@@ -2,8 +2,7 @@
 
 A skill's steps r_t are described by coefficients C of the phase basis, r_t = sum_k b_k(t) C_k, a linear function of
 the encoder's mean input; z are the principal components of C; pi's linear path gives r_t back from z b_k(t). So the
-first rollout is as good as principal components, and what the LSTMs learn comes on top. Without this start the same
-loss takes thousands of steps (figures: python/README.md).
+first rollout is as good as principal components, and what the LSTMs learn comes on top (figures: python/README.md).
 """
 
 from __future__ import annotations
