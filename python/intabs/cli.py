@@ -60,3 +60,7 @@ def _one_line(text: str) -> str:
 
 def main() -> None:
     sys.exit(run(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()
