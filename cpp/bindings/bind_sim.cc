@@ -4,7 +4,9 @@
 #include <pybind11/stl.h>
 
 #include "intabs/sim/session.h"
+#include "intabs/skills/kinematic_rollout.h"
 #include "intabs/skills/skill_controller.h"
+#include "intabs/skills/skill_library.h"
 
 namespace py = pybind11;
 
@@ -53,6 +55,13 @@ NetworkOptions FormatOptions(const std::string& format) {
   return options;
 }
 
+constexpr int kFilmWidth = 320, kFilmHeight = 240;
+constexpr double kNudge = 0.04;       // [m]
+constexpr double kNudgeWithin = 0.12;  // [m] of the tip
+
+template <typename T>
+using Array = py::array_t<T, py::array::c_style | py::array::forcecast>;
+
 // Session + skill controller: one closed-loop run.
 class Rollout {
  public:
@@ -61,28 +70,45 @@ class Rollout {
       : session_(models_dir, task,
                  perception_config.empty() ? std::nullopt
                                            : std::optional<PerceptionConfig>(LoadPerceptionConfig(perception_config))),
-        policy_(Policy::Load(weights_dir, ArmModel::Lite6(), FormatOptions(format))) {}
+        player_(SkillPlayer::Load(weights_dir, ArmModel::Lite6(), FormatOptions(format))),
+        library_(LoadSkillLibrary(weights_dir)) {}
 
-  py::dict Run(int64_t seed, double spread_cm, const py::array_t<float, py::array::c_style | py::array::forcecast>& z,
-               const std::vector<int>& ticks, int settle_ticks, const std::string& ablate) {
-    if (z.ndim() != 2 || z.shape(1) != kLatentDim || z.shape(0) != static_cast<py::ssize_t>(ticks.size()))
-      throw py::value_error("z must be (n, 16) with one number of ticks a row");
-    std::vector<Skill> skills(ticks.size());
-    for (size_t i = 0; i < skills.size(); ++i) {
-      skills[i].z = Eigen::Map<const LatentVector>(z.data(i, 0));
-      skills[i].min_ticks = skills[i].max_ticks = ticks[i];
+  py::dict Reset(int64_t seed, double spread_cm) {
+    {
+      py::gil_scoped_release release;
+      session_.Reset(seed, spread_cm);
     }
-    SkillController controller(policy_, 1);
+    return Observe(session_);
+  }
+
+  py::dict Run(const Array<float>& z, const Array<int>& ticks, const std::vector<int>& library_index, int settle_ticks,
+               const std::string& ablate, bool nudge, int film_every) {
+    const auto count = static_cast<py::ssize_t>(library_index.size());
+    if (z.ndim() != 2 || z.shape(1) != kLatentDim || z.shape(0) != count || ticks.ndim() != 2 || ticks.shape(0) != count ||
+        ticks.shape(1) != 2)
+      throw py::value_error("z must be (n, 16), ticks (n, 2), library_index n numbers");
+    std::vector<Skill> skills(library_index.size());
+    for (size_t i = 0; i < skills.size(); ++i) {
+      const auto row = static_cast<py::ssize_t>(i);
+      const auto at = static_cast<size_t>(library_index[i]);
+      if (library_index[i] >= 0 && at >= library_.size()) throw py::value_error("library_index out of range");
+      if (library_index[i] >= 0) skills[i] = library_[at];
+      skills[i].z = Eigen::Map<const LatentVector>(z.data(row, 0));
+      skills[i].min_ticks = *ticks.data(row, 0);
+      skills[i].max_ticks = *ticks.data(row, 1);
+    }
+    SkillController controller(player_, 1);
     controller.player().ZeroActions(ablate == "policy");
     bool success = false;
     std::vector<double> q, poses_trace, gripper;
+    std::vector<int> skill_trace;
+    std::vector<Snapshot> film;
     uint64_t hash = 0;
     uint32_t subgoals = 0;
     double seconds = 0;
     std::string reason;
     {
       py::gil_scoped_release release;
-      session_.Reset(seed, spread_cm);
       if (controller.Start(1, skills) != Status::kOk) throw std::runtime_error("the plan is empty, too long or not finite");
       ObjectPoses first = session_.poses();
       ArmCommand command;
@@ -95,13 +121,19 @@ class Rollout {
             poses.objects[i] = first.objects[i];
           }
         }
+        const bool was_closed = session_.status().gripper_closed;
         (void)controller.Tick(session_.status(), poses, command);
+        if (nudge && command.gripper_closed && !was_closed) nudge = !Nudge();
         (void)session_.Advance(command);
         for (int i = 0; i < kNumJoints; ++i) q.push_back(session_.status().q[i]);
         gripper.push_back(session_.status().gripper_closed ? 1 : 0);
+        skill_trace.push_back(controller.player().status().skill_index);
         for (const TrackedObject& o : session_.world().Objects()) {
           poses_trace.insert(poses_trace.end(), {o.X_WO.p.x(), o.X_WO.p.y(), o.X_WO.p.z(), o.X_WO.q.w(), o.X_WO.q.x(),
                                                  o.X_WO.q.y(), o.X_WO.q.z()});
+        }
+        if (film_every > 0 && skill_trace.size() % static_cast<size_t>(film_every) == 0) {
+          session_.world().Save(film.emplace_back());
         }
         subgoals |= session_.world().Subgoals();
         if (!controller.player().playing()) --left;
@@ -111,23 +143,130 @@ class Rollout {
       hash = session_.world().StateHash();
       seconds = 1e-6 * static_cast<double>(session_.status().utime);
     }
+    const PlayerStatus& status = controller.player().status();
     py::dict d;
     d["success"] = success;
     d["reason"] = reason;
     d["subgoals"] = subgoals;
     d["state_hash"] = hash;
     d["duration_s"] = seconds;
-    d["end_reason"] = static_cast<int>(controller.player().status().end_reason);
+    d["end_reason"] = static_cast<int>(status.end_reason);
+    d["skill"] = status.skill_index;
+    d["retries"] = status.retries;
     const auto n = static_cast<py::ssize_t>(gripper.size());
     d["q"] = py::array_t<double>({n, py::ssize_t{kNumJoints}}, q.data());
     d["gripper"] = py::array_t<double>(n, gripper.data());
+    d["skills"] = py::array_t<int>(n, skill_trace.data());
     d["object_pose"] = py::array_t<double>({n, py::ssize_t{kMaxObjects}, py::ssize_t{7}}, poses_trace.data());
+    py::list pictures;
+    for (const Snapshot& snapshot : film) pictures.append(Picture(snapshot));
+    d["pictures"] = pictures;
     return d;
   }
 
  private:
+  py::array_t<uint8_t> Picture(const Snapshot& snapshot) {
+    if (!renderer_) renderer_ = std::make_unique<Renderer>(session_.world(), kFilmWidth, kFilmHeight);
+    py::array_t<uint8_t> rgb({kFilmHeight, kFilmWidth, 3});
+    renderer_->Render(snapshot, renderer_->FindCamera("overview"), rgb.mutable_data());
+    return rgb;
+  }
+
+  // Knocks the object at the tip out of the closing fingers, along the axis in which they leave it room. Whether there was one.
+  bool Nudge() {
+    const Pose X_WG = ArmModel::Lite6().Tip(session_.status().q);
+    const auto objects = session_.world().Objects();
+    int nearest = -1;
+    double distance = kNudgeWithin;
+    for (int i = 0; i < kMaxObjects; ++i) {
+      if (objects[i].id < 0) continue;
+      if (const double d = (objects[i].X_WO.p - X_WG.p).norm(); d < distance) {
+        distance = d;
+        nearest = i;
+      }
+    }
+    if (nearest < 0) return false;
+    Eigen::Vector3d along = X_WG.q * Eigen::Vector3d::UnitX();
+    along.z() = 0;
+    if (along.norm() < 0.3) along = Eigen::Vector3d::UnitX();
+    session_.Nudge(nearest, kNudge * along.normalized());
+    return true;
+  }
+
   Session session_;
-  Policy policy_;
+  SkillPlayer player_;
+  std::vector<Skill> library_;
+  std::unique_ptr<Renderer> renderer_;
+};
+
+// Many plans at once, in the head.
+class Imagination {
+ public:
+  Imagination(const std::string& weights_dir, int n, const std::string& format)
+      : rollout_(WeightsFile::Load(weights_dir), ArmModel::Lite6(), n, FormatOptions(format)) {}
+
+  py::dict Run(const JointVector& q, bool gripper_closed, const Array<double>& object_pose, const Array<bool>& object_known,
+               const std::vector<Array<float>>& z, const std::vector<std::vector<int>>& ticks) {
+    if (object_pose.ndim() != 2 || object_pose.shape(0) != kMaxObjects || object_pose.shape(1) != 7 ||
+        object_known.ndim() != 1 || object_known.shape(0) != kMaxObjects || z.size() != ticks.size())
+      throw py::value_error("object_pose must be (4, 7), object_known (4,), z and ticks one entry a plan");
+    Observation start;
+    start.q = q;
+    start.gripper_closed = gripper_closed;
+    for (int i = 0; i < kMaxObjects; ++i) {
+      if (!*object_known.data(i)) continue;
+      const double* v = object_pose.data(i, 0);
+      start.objects[i].id = i;
+      start.objects[i].valid = true;
+      start.objects[i].X_WO = {{v[0], v[1], v[2]}, Eigen::Quaterniond(v[3], v[4], v[5], v[6])};
+    }
+    std::vector<std::vector<Skill>> plans(z.size());
+    int longest = 0;
+    for (size_t i = 0; i < z.size(); ++i) {
+      const auto skills = static_cast<py::ssize_t>(ticks[i].size());
+      if (z[i].ndim() != 2 || z[i].shape(0) != skills || z[i].shape(1) != kLatentDim)
+        throw py::value_error("z of each plan must be (skills, 16), ticks skills numbers");
+      int length = 0;
+      for (py::ssize_t k = 0; k < skills; ++k) {
+        Skill s;
+        s.z = Eigen::Map<const LatentVector>(z[i].data(k, 0));
+        s.min_ticks = s.max_ticks = ticks[i][static_cast<size_t>(k)];
+        if (s.max_ticks < 1) throw py::value_error("a skill lasts 1 tick or more");
+        plans[i].push_back(s);
+        length += s.max_ticks;
+      }
+      longest = std::max(longest, length);
+    }
+    const auto n = static_cast<py::ssize_t>(plans.size());
+    py::array_t<double> joints({n, py::ssize_t{longest}, py::ssize_t{kNumJoints}});
+    py::array_t<bool> gripper({n, py::ssize_t{longest}});
+    py::array_t<double> poses({n, py::ssize_t{longest}, py::ssize_t{kMaxObjects}, py::ssize_t{7}});
+    Status status;
+    {
+      py::gil_scoped_release release;
+      status = rollout_.Run(start, plans, [&](int t) {
+        for (py::ssize_t i = 0; i < n; ++i) {
+          const Observation& o = rollout_.states()[static_cast<size_t>(i)];
+          for (int k = 0; k < kNumJoints; ++k) *joints.mutable_data(i, t, k) = o.q[k];
+          *gripper.mutable_data(i, t) = o.gripper_closed;
+          for (int k = 0; k < kMaxObjects; ++k) {
+            const Pose& X = o.objects[k].X_WO;
+            const double is[7] = {X.p.x(), X.p.y(), X.p.z(), X.q.w(), X.q.x(), X.q.y(), X.q.z()};
+            std::copy(is, is + 7, poses.mutable_data(i, t, k, 0));
+          }
+        }
+      });
+    }
+    if (status != Status::kOk) throw py::value_error("no plan, more plans than there is room for, or a value that is not finite");
+    py::dict d;
+    d["q"] = joints;
+    d["gripper"] = gripper;
+    d["object_pose"] = poses;
+    return d;
+  }
+
+ private:
+  KinematicRollout rollout_;
 };
 
 }  // namespace
@@ -169,11 +308,24 @@ void Bind_sim(py::module_& m) {
       .def(py::init<const std::string&, const std::string&, const std::string&, const std::string&, const std::string&>(),
            py::arg("models_dir"), py::arg("task"), py::arg("weights_dir"), py::arg("perception_config") = "",
            py::arg("format") = "", "format of pi's weights: fp32, 16, 8; empty: the manifest's.")
-      .def("run", &Rollout::Run, py::arg("seed"), py::arg("spread_cm"), py::arg("z"), py::arg("ticks"),
-           py::arg("settle_ticks") = 25, py::arg("ablate") = "",
-           "z (n, 16), ticks: n durations. ablate: '', 'objects' (poses frozen at their first value) or 'policy' (zeros).\n"
-           "Returns success, reason, subgoals (bits), state_hash, duration_s, end_reason and, after each tick, q (T, 6),\n"
-           "gripper (T,) and the true object_pose (T, 4, 7).");
+      .def("reset", &Rollout::Reset, py::arg("seed"), py::arg("spread_cm"), "Starts over; what is seen then (Session.observe).")
+      .def("run", &Rollout::Run, py::arg("z"), py::arg("ticks"), py::arg("library_index"), py::arg("settle_ticks") = 25,
+           py::arg("ablate") = "", py::arg("nudge") = false, py::arg("film_every") = 0,
+           "From where reset left it. z (n, 16); ticks (n, 2): shortest and longest duration; library_index: n numbers, -1: a\n"
+           "skill without a record. ablate: '', 'objects' (poses frozen at their first value) or 'policy' (zeros). nudge: the\n"
+           "first time the fingers close about an object it is knocked away by 4 cm. film_every: a picture each so many ticks.\n"
+           "Returns success, reason, subgoals (bits), state_hash, duration_s, end_reason, skill (the last that ran), retries and,\n"
+           "after each tick, q (T, 6), gripper (T,), skills (T,) and the true object_pose (T, 4, 7), and\n"
+           "pictures [(240, 320, 3) uint8 RGB].");
+
+  py::class_<Imagination>(m, "KinematicRollout", "Plans played in the head: pi closed on its own predictions, many at once.")
+      .def(py::init<const std::string&, int, const std::string&>(), py::arg("weights_dir"), py::arg("n"), py::arg("format") = "",
+           "n: plans at a time, at most.")
+      .def("run", &Imagination::Run, py::arg("q"), py::arg("gripper_closed"), py::arg("object_pose"), py::arg("object_known"),
+           py::arg("z"), py::arg("ticks"),
+           "From joints q (6,), object_pose (4, 7), object_known (4,). z: for each plan (skills, 16); ticks: for each plan how\n"
+           "long its skills last. Returns after each tick q (n, T, 6), gripper (n, T), object_pose (n, T, 4, 7); a plan that is\n"
+           "over keeps its last state. ValueError if something does not fit or is not finite.");
 }
 
 }  // namespace intabs

@@ -13,6 +13,7 @@ try:
         plant_control_t,
         plant_truth_t,
         reset_t,
+        skill_control_t,
         skill_plan_t,
         skill_status_t,
         skill_t,
@@ -29,6 +30,7 @@ CHANNELS = {
     "PERCEPTION_STATUS": perception_status_t,
     "SKILL_PLAN": skill_plan_t,
     "SKILL_STATUS": skill_status_t,
+    "SKILL_CONTROL": skill_control_t,
     "LOOP_STATUS": loop_status_t,
     "PLANT_TRUTH": plant_truth_t,
     "PLANT_CONTROL": plant_control_t,
@@ -46,7 +48,8 @@ SKILLS_PER_PART = 16  # of a SKILL_PLAN message: 1400 bytes hold no more
 
 
 def plan_parts(plan_id: int, skills: list[dict]) -> list[skill_plan_t]:
-    """A plan as messages. Each skill: {"z": [16 floats], "min_ticks": n, "max_ticks": n}."""
+    """A plan as messages. Each skill: {"z": [16 floats], "min_ticks": n, "max_ticks": n}, and
+    {"library_index": n} if it is one of the library beside the weights."""
     chunks = [skills[i : i + SKILLS_PER_PART] for i in range(0, len(skills), SKILLS_PER_PART)]
     parts = []
     for number, chunk in enumerate(chunks):
@@ -58,7 +61,7 @@ def plan_parts(plan_id: int, skills: list[dict]) -> list[skill_plan_t]:
         for entry in chunk:
             skill = skill_t()
             skill.z = [float(v) for v in entry["z"]]
-            skill.library_index = -1
+            skill.library_index = int(entry.get("library_index", -1))
             skill.min_ticks, skill.max_ticks = int(entry["min_ticks"]), int(entry["max_ticks"])
             message.skills.append(skill)
         parts.append(message)

@@ -1,4 +1,4 @@
-"""Plays the plan of a task with the C++ programs, watches, and scores. Python starts, watches and stops them; between
+"""Plays a plan for a task with the C++ programs, watches, and scores. Python starts, watches and stops them; between
 camera and arm there is none of it.
 """
 
@@ -12,16 +12,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from intabs import bus, messages, paths
-from intabs.errors import UserError
+import numpy as np
+
+from intabs import _core, bus, messages, paths
+from intabs.errors import UserError, as_user_error
 from intabs.processes import Processes, free_ports, shared_memory_name, terminated_like_interrupted
+from intabs.skills.library import Frame, Library, weights_folder
+from intabs.skills.planner import Plan, Planner, whole
 
 WEIGHTS = "lite6"
 CAMERAS = ("left", "right")  # of the plant that perception sees
-SUBGOALS = {"pick_place": ("grasped", "lifted", "placed")}
 SETTLE_S = 2.0  # after the plan's end: so long may success take to show
 TICK_S = 0.04  # policy
-MAX_SKILL_TICKS = 15000  # skills/skill_player.h
+TRIES = 2.0  # so many times the plan's longest duration may a run last: skills are tried again
 
 # skills/skill_player.h EndReason
 RUNNING, FINISHED = 1, 2
@@ -30,12 +33,13 @@ END_REASONS = {
     4: "perception went silent",
     5: "a reading or the policy's output was not finite",
     6: "the driver refused to go on (fault, stop, or another session)",
+    7: "an object did not move as in the demonstration, however often it was tried",
 }
 
 
 @dataclass
 class Options:
-    task: str = "pick_place"
+    task: str = "pick_place"  # or several, joined by +: one after the other, in the world of that name
     perception: str = "tags"
     clock: str = "lockstep"
     arm: str = "plant"  # or "lite6": the driver, and a fake controller with the plant behind it; clock "wall" alone
@@ -43,29 +47,8 @@ class Options:
     spread: float = 2.0  # cm
     out: Path = Path("out/demo")
     viewer: bool = False
-
-
-def load_plan(task: str, weights: Path) -> list[dict]:
-    """Skills of the task's shipped plan."""
-    if not weights.is_dir():
-        raise UserError(f"{weights}: no such weights; train and export them, or check out the repository whole")
-    path = weights / "plans" / f"{task}.json"
-    if not path.is_file():
-        known = sorted(p.stem for p in (weights / "plans").glob("*.json"))
-        raise UserError(f"unknown task '{task}': known are {', '.join(known) or 'none'} ({path.parent})")
-    try:
-        skills = json.loads(path.read_text())["skills"]
-        messages.plan_parts(1, skills)
-        for number, skill in enumerate(skills):
-            if len(skill["z"]) != 16 or not all(abs(v) < 1e6 for v in skill["z"]):
-                raise ValueError(f"skill {number}: z must be 16 finite numbers")
-            if not 1 <= int(skill["min_ticks"]) <= int(skill["max_ticks"]) <= MAX_SKILL_TICKS:
-                raise ValueError(f"skill {number}: needs 1 <= min_ticks <= max_ticks <= {MAX_SKILL_TICKS}")
-    except (ValueError, KeyError, TypeError, OverflowError) as e:
-        raise UserError(f"{path}: not a plan ({type(e).__name__}: {e}); export the weights again") from None
-    if not skills:
-        raise UserError(f"{path}: has no skills; export the weights again")
-    return skills
+    plan: Callable[[Planner, Frame], Plan] | None = None  # None: the demonstration that began most like what is seen
+    weights: str = WEIGHTS
 
 
 class _Run:
@@ -105,6 +88,17 @@ class _Run:
     def on_perception(self, m) -> None:
         if m.n:
             self.fps = min(m.fps[: m.n])
+
+    def first_frame(self, status: messages.lite6_status_t, truth: bool) -> Frame | None:
+        """What is seen first: in lockstep the same whenever we hear of it."""
+        heard = self.truth if truth else self.poses
+        if not heard:
+            return None
+        m = heard[min(heard)]
+        pose = np.concatenate([np.array(m.p_WO), np.array(m.q_WO)], 1)
+        known = np.array(m.id) >= 0 if truth else (np.array(m.id) >= 0) & np.array(m.valid, bool)
+        pose[~known] = (0, 0, 0, 1, 0, 0, 0)
+        return Frame(np.array(status.q), bool(status.gripper_closed), pose, known)
 
     def sees(self) -> bool:
         """Perception keeps up: its newest poses are at most .2 s behind the plant."""
@@ -159,8 +153,11 @@ class _Run:
 def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, str]:
     """One run. Returns its figures (as in summary.json) and, if the task failed, why. Raises UserError if something
     broke. `report(share, text)` is called while it runs."""
-    weights = paths.MODELS / "weights" / WEIGHTS
-    skills = load_plan(options.task, weights)
+    weights = weights_folder(options.weights)
+    library = Library.load(weights)
+    whole(library, options.task, None)  # an unknown task is told before anything starts
+    with as_user_error(RuntimeError, ValueError):
+        subgoals = _core.World(str(paths.MODELS), options.task).subgoal_names
     worlds = ("fake_lite6", "lite6") if options.arm == "lite6" else ("plant",)
     programs = {name: paths.program(f"intabs_{name}") for name in (*worlds, "perception", "control")}
     bus.require_route()
@@ -173,7 +170,6 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
     url, ring = bus.private_url(), shared_memory_name()
     run = _Run(random.SystemRandom().getrandbits(62) + 1, options.clock == "lockstep", options.arm == "lite6")
     # By the wall clock the arm holds while perception is behind.
-    limit_s = sum(s["max_ticks"] for s in skills) * TICK_S + (5.0 if options.clock == "lockstep" else 60.0)
     with terminated_like_interrupted(), Processes(out / "logs") as processes:
         listener = bus.Bus(url)
         listener.subscribe("PLANT_TRUTH", run.on_truth)
@@ -230,10 +226,16 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
         )
         if options.perception == "tags":
             wait_for(run.sees, 20, "intabs_perception sent no fresh poses")
-        plan = messages.plan_parts(run.plan_id, skills)
+        seen = run.first_frame(_first_status(url, processes), options.perception == "truth")
+        plan = options.plan(Planner(weights), seen) if options.plan else whole(library, options.task, seen)
+        report(0.0, plan.about)
+        parts = messages.plan_parts(run.plan_id, plan.as_messages())
+        longest_s = sum(s.max_ticks for s in plan.skills) * TICK_S
+        # By the wall clock the arm holds while perception is behind.
+        limit_s = TRIES * longest_s + (5.0 if options.clock == "lockstep" else 60.0)
 
         def send_plan() -> None:
-            for part in plan:
+            for part in parts:
                 listener.publish("SKILL_PLAN", part)
 
         wait_for(lambda: run.skill, 20, "intabs_control did not take the plan", again=send_plan)
@@ -249,8 +251,25 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
             raise UserError(f"{name} did not end cleanly (exit code {code}): {processes.last_line(name)}")
 
     end_us, success = end
-    summary = _summary(options, run, end_us, success, {n: _figures(f) for n, f in figures.items()})
+    summary = _summary(options, run, end_us, success, {n: _figures(f) for n, f in figures.items()}, subgoals)
+    summary["plan"] = {"about": plan.about, "skills": [s.index for s in plan.skills], "retries": run.skill.retries}
+    if plan.predicted is not None:
+        summary["plan"] |= {"predicted": plan.predicted.tolist(), "search_s": plan.search_s, "verify_s": plan.verify_s}
     return summary, "" if success else _why(run, summary, end_us)
+
+
+def _first_status(url: str, processes: Processes) -> messages.lite6_status_t:
+    """Heard on a connection of its own: at 250 Hz nobody here wants to hear the others."""
+    heard: list = []
+    ear = bus.Bus(url)
+    ear.subscribe("LITE6_STATUS", heard.append)
+    until = time.monotonic() + 20
+    while not heard:
+        processes.check()
+        if time.monotonic() > until:
+            raise UserError("no LITE6_STATUS within 20 s")
+        ear.handle(100)
+    return heard[0]
 
 
 def _standing(run: _Run) -> tuple[float, str]:
@@ -272,7 +291,9 @@ def _percentile(values: list[float], share: float) -> float | None:
     return ordered[max(0, math.ceil(share * len(ordered)) - 1)]
 
 
-def _summary(options: Options, run: _Run, end_us: int, success: bool, figures: dict[str, dict]) -> dict:
+def _summary(
+    options: Options, run: _Run, end_us: int, success: bool, figures: dict[str, dict], subgoals: list[str]
+) -> dict:
     bits = run.subgoals(end_us)
     errors = run.object_errors_mm(end_us)
     ticks = [u for u in run.skill_utimes if u <= end_us]
@@ -285,9 +306,7 @@ def _summary(options: Options, run: _Run, end_us: int, success: bool, figures: d
         "perception_source": options.perception,
         "clock": options.clock,
         "success": success,
-        "subtasks": [
-            {"name": name, "success": bool(bits >> i & 1)} for i, name in enumerate(SUBGOALS.get(options.task, ()))
-        ],
+        "subtasks": [{"name": name, "success": bool(bits >> i & 1)} for i, name in enumerate(subgoals)],
         "duration_s": round((end_us - run.start_us) * 1e-6, 3),
         "control": {
             "rate_hz": round(1e6 * (len(ticks) - 1) / (ticks[-1] - ticks[0]), 3) if len(ticks) > 1 else None,

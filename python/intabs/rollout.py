@@ -14,11 +14,15 @@ import numpy as np
 from intabs import _core, paths
 from intabs.errors import UserError, as_user_error
 from intabs.jobs import in_processes
-from intabs.play import END_REASONS, load_plan
+from intabs.output import write_json
+from intabs.play import END_REASONS
+from intabs.skills.library import Frame, Library, weights_folder
+from intabs.skills.planner import Planner, goals_of, seen_from, whole
 
 ABLATIONS = ("", "objects", "z", "policy")
 UNSEEN = 1_000_000  # seeds of rollouts start here; `intabs collect` counts up from 0
 SETTLE_TICKS = 50
+STRIP = 12  # pictures of a failure
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,12 @@ class Setting:
     seed: int
     ablate: str
     format: str = ""  # of the weights, as the network runs them; empty: the manifest's
+    plan: str = (
+        "whole"  # the demonstration that began most like now, or "goal": found for the poses the task leaves behind
+    )
+    nudge: bool = False  # the first grasp is made to fail
+    source: str = ""  # plays this demonstration's skills
+    film: str = ""  # folder for a strip of pictures of each failure
 
 
 def wilson(successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
@@ -65,19 +75,31 @@ def _run_trial(setting: Setting, trial: int) -> dict:
     if key not in _cache:
         _cache.clear()
         config = str(paths.MODELS / "config/perception.yaml") if setting.perception == "tags" else ""
-        _cache[key] = _core.Rollout(str(paths.MODELS), setting.task, setting.weights, config, setting.format)
-    skills = load_plan(setting.task, Path(setting.weights))
-    z = np.array([s["z"] for s in skills], "f4")
-    ticks = [int(s["max_ticks"]) for s in skills]
+        world = _core.Rollout(str(paths.MODELS), setting.task, setting.weights, config, setting.format)
+        planner = Planner(Path(setting.weights))
+        _cache[key] = world, planner
+    world, planner = _cache[key]
     seed = setting.seed + trial
+    seen = seen_from(world.reset(seed, setting.spread))
+    if setting.plan == "goal":
+        plan = planner.find(goals_of(planner.library, setting.task, seen), seen)
+    else:
+        plan = whole(planner.library, setting.task, seen, setting.source)
+    z, ticks, index = plan.arrays()
     if setting.ablate == "z":
         z = z[np.random.default_rng(seed).permutation(len(z))]
-    result = _cache[key].run(seed, setting.spread, z, ticks, SETTLE_TICKS, setting.ablate)
-    for trace in ("q", "gripper", "object_pose"):
+    film = max(1, int(ticks[:, 1].sum()) // STRIP) if setting.film else 0
+    result = world.run(z, ticks, index, SETTLE_TICKS, setting.ablate, setting.nudge, film)
+    for trace in ("q", "gripper", "object_pose", "skills"):
         result.pop(trace)
+    pictures = result.pop("pictures")
+    result["displaced_cm"] = displaced_cm(planner.library, setting.task, seen)
+    if pictures and not result["success"]:
+        write_strip(Path(setting.film) / f"failed_{trial:04d}.png", pictures)
     if not result["success"] and result["end_reason"] in END_REASONS:
         result["reason"] = END_REASONS[result["end_reason"]]
-    return {"trial": trial, "seed": seed, **result}
+    timing = {} if setting.plan == "whole" else {"search_s": plan.search_s, "verify_s": plan.verify_s}
+    return {"trial": trial, "seed": seed, "plan": plan.about, **timing, **result}
 
 
 def rollout(
@@ -91,19 +113,22 @@ def rollout(
     ablate: str = "",
     report: Path | None = None,
     resume: bool = False,
+    plan: str = "whole",
+    nudge: bool = False,
     progress: Callable[[int, str], None] = lambda done, text: None,
 ) -> dict:
-    """Runs `trials` trials with seeds seed, seed + 1, ...; with `report` each result is kept in trials.jsonl, and
-    `resume` runs only those that are missing there."""
+    """Runs `trials` trials with seeds seed, seed + 1, ... plan, nudge: as in Setting. With `report` each result is
+    kept in trials.jsonl, `resume` runs only those that are missing there; beside it figures.json, a strip of
+    pictures of each failure, and success against displacement (displacement.png)."""
     if ablate not in ABLATIONS:
         raise UserError(f"--ablate {ablate}: known are objects, z, policy")
-    shipped = paths.MODELS / "weights" / weights
-    weights = shipped if shipped.is_dir() else Path(weights)
+    weights = weights_folder(weights)
     with as_user_error(RuntimeError, ValueError):  # before any trial
-        load_plan(task, weights)
+        whole(Library.load(weights), task, None)
         _core.Rollout(str(paths.MODELS), task, str(weights))
     sha256 = json.loads((weights / "manifest.json").read_text())["sha256"]
-    setting = Setting(task, str(weights), spread, perception, seed, ablate)
+    film = str(report) if report is not None else ""
+    setting = Setting(task, str(weights), spread, perception, seed, ablate, plan=plan, nudge=nudge, film=film)
     results: dict[int, dict] = {}
     log = None
     if report is not None:
@@ -132,7 +157,7 @@ def rollout(
         log.close()
     done = [results[i] for i in range(trials)]
     successes = sum(r["success"] for r in done)
-    return {
+    figures = {
         "task": task,
         "trials": trials,
         "success": successes,
@@ -143,4 +168,62 @@ def rollout(
         "perception": perception,
         "seed": seed,
         "ablate": ablate,
+        "retried": sum(r["retries"] > 0 for r in done),
     }
+    if plan == "goal":
+        times = {k: [r[k] for r in done] for k in ("search_s", "verify_s")}
+        figures |= {k: {"p50": float(np.median(v)), "max": max(v)} for k, v in times.items() if v}
+    if report is not None:
+        write_json(report / "figures.json", figures)
+        plot_displacement(report / "displacement.png", task, done)
+    return figures
+
+
+def displaced_cm(library: Library, task: str, seen: Frame) -> float:
+    """How far the objects lie from where they lay on average in the task's demonstrations: the farthest of them, cm."""
+    away = 0.0
+    for one in task.split("+"):
+        first = [chain[0].frames[0] for chain in library.of_task(one)]
+        for slot in range(len(seen.known)):
+            places = [f.object_pose[slot, :3] for f in first if f.known[slot]]
+            if places and seen.known[slot]:
+                away = max(away, float(np.linalg.norm(seen.object_pose[slot, :3] - np.mean(places, 0))))
+    return 100 * away
+
+
+def write_strip(path: Path, pictures: list[np.ndarray]) -> None:
+    """Side by side in two rows."""
+    from PIL import Image
+
+    half = (len(pictures) + 1) // 2
+    black = np.zeros_like(pictures[0])
+    rows = [
+        np.concatenate([*row, *[black] * (half - len(row))], 1) for row in (pictures[:half], pictures[half:]) if row
+    ]
+    Image.fromarray(np.concatenate(rows)).save(path)
+
+
+def plot_displacement(path: Path, task: str, done: list[dict]) -> None:
+    """Rate of success and its 95 % interval in fifths of the trials, by displacement."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    order = np.argsort([r["displaced_cm"] for r in done])
+    figure, ax = pyplot.subplots(figsize=(6, 4), constrained_layout=True)
+    for part in np.array_split(order, min(5, len(order))):
+        x = np.array([done[i]["displaced_cm"] for i in part])
+        good = sum(done[i]["success"] for i in part)
+        low, high = wilson(good, len(part))
+        rate = good / len(part)
+        ax.errorbar(
+            x.mean(), rate, [[rate - low], [high - rate]], [[x.mean() - x.min()], [x.max() - x.mean()]], "o", color="C0"
+        )
+    for success, y in ((True, 1.04), (False, -0.04)):
+        x = [r["displaced_cm"] for r in done if r["success"] == success]
+        ax.plot(x, [y] * len(x), "|", color="C2" if success else "C3")
+    ax.set(xlabel="displacement of the farthest object [cm]", ylabel="success", ylim=(-0.08, 1.08))
+    ax.set_title(f"{task}: {sum(r['success'] for r in done)} of {len(done)}")
+    figure.savefig(path, dpi=120)
+    pyplot.close(figure)

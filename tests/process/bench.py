@@ -11,6 +11,8 @@ import pytest
 
 from intabs import bus, messages, paths, play
 from intabs.processes import Processes, shared_memory_name
+from intabs.skills.library import Library
+from intabs.skills.planner import whole
 
 IDLE, TRACKING, SLOWING, HOLDING, FAULT, STOPPED = range(6)  # core/types.h ArmState
 STALE_COMMAND = 1  # Fault
@@ -23,8 +25,8 @@ def need_programs() -> None:
     missing = [n for n in ("plant", "perception", "control") if not (paths.BIN / f"intabs_{n}").exists()]
     if missing:
         pytest.skip(f"not built in {paths.BIN}: {', '.join(missing)}", allow_module_level=True)
-    if not (WEIGHTS / "plans" / f"{TASK}.json").exists():
-        pytest.skip(f"{WEIGHTS} has no plan for {TASK}: train and export first", allow_module_level=True)
+    if not (WEIGHTS / "skills.json").exists():
+        pytest.skip(f"{WEIGHTS} has no skill library: train and export first", allow_module_level=True)
     if fault := bus.route_fault():
         pytest.skip(f"no multicast route ({fault}): {bus.ROUTE_CURE}", allow_module_level=True)
 
@@ -96,7 +98,7 @@ class Bench:
 
     def play(self, plan_id: int = 1) -> None:
         """Sends the plan until control has taken it."""
-        parts = messages.plan_parts(plan_id, play.load_plan(TASK, WEIGHTS))
+        parts = messages.plan_parts(plan_id, whole(Library.load(WEIGHTS), TASK, None).as_messages())
 
         def taken() -> bool:
             for part in parts:

@@ -13,7 +13,7 @@ TICKS = 60
 HEARS = {
     "plant": {"LITE6_STATUS", "LITE6_COMMAND", "ESTOP", "RESET", "PLANT_CONTROL"},
     "perception": {"LITE6_STATUS"},
-    "control": {"LITE6_STATUS", "OBJECT_POSES", "SKILL_PLAN"},
+    "control": {"LITE6_STATUS", "OBJECT_POSES", "SKILL_PLAN", "SKILL_CONTROL"},
 }
 
 

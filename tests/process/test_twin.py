@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from bench import TASK, WEIGHTS, Bench, need_programs
-from intabs import _core, paths, play
+from intabs import _core, paths
+from intabs.skills.library import Library
+from intabs.skills.planner import whole
 
 need_programs()
 
@@ -14,11 +16,9 @@ TICK_US = 40_000
 
 def in_process(perception: str, seed: int = SEED) -> dict:
     config = str(paths.MODELS / "config/perception.yaml") if perception == "tags" else ""
-    skills = play.load_plan(TASK, WEIGHTS)
-    z = np.array([s["z"] for s in skills], "f4")
-    return _core.Rollout(str(paths.MODELS), TASK, str(WEIGHTS), config).run(
-        seed, SPREAD, z, [s["max_ticks"] for s in skills], settle_ticks=5
-    )
+    rollout = _core.Rollout(str(paths.MODELS), TASK, str(WEIGHTS), config)
+    rollout.reset(seed, SPREAD)
+    return rollout.run(*whole(Library.load(WEIGHTS), TASK, None).arrays(), settle_ticks=5)
 
 
 @pytest.mark.parametrize("perception", ["truth", "tags"])

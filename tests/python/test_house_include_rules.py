@@ -14,7 +14,7 @@ RULES = {
     "rt": ((), ("eigen", "posix")),
     "nn": ((), ("eigen", "json", "posix")),
     "kinematics": ((), ("eigen", "urdf", "kdl")),
-    "skills": (("nn", "kinematics/arm_model.h"), ("eigen",)),
+    "skills": (("nn", "kinematics/arm_model.h"), ("eigen", "json")),
     "control": (("kinematics/arm_model.h",), ("eigen",)),
     "perception": ((), ("eigen", "opencv", "apriltag")),
     "camera": ((), ("eigen", "opencv", "realsense", "posix")),

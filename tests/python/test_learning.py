@@ -193,6 +193,51 @@ def test_turning_the_scene_about_the_base_changes_no_feature_but_joint_1(demonst
     torch.testing.assert_close(a, torch.cat([a[..., :1], b[..., 1:]], -1), atol=2e-3, rtol=0)
 
 
+def test_strangers_rest_in_slots_that_the_demonstration_does_not_use(demonstrations):
+    found, space = demonstrations
+    found = [*found]
+    other = found[0].state.map(torch.clone)  # another task: its object in slot 3
+    for x in (other.p, other.R, other.known, other.valid):
+        x[:, 3] = x[:, 0]
+    found[0] = type(found[0])(other, found[0].command, found[0].source)
+    rng = np.random.default_rng(0)
+    plain = WindowSampler(found[1:], space, 30, (8, 24)).sample(16, np.random.default_rng(0))
+    assert not plain.state.known[:, :, 3].any()
+    w = WindowSampler(found, space, 30, (8, 24), strangers=1.0).sample(32, rng)
+    shown = (w.state.known[:, 0, 3] > 0).nonzero()[:, 0]
+    assert len(shown) > 16 and not w.state.known[:, :, 2].any()
+    moves = (w.state.p[:, 1:, 3] - w.state.p[:, :1, 3]).abs().amax((1, 2))
+    assert (moves == 0).sum() >= len(shown) - 16  # all but those of the demonstration itself
+    assert (w.state.p[shown, 0, 3] != w.shown.p[shown, 0, 3]).any()  # the encoders see others
+
+
+def test_encoders_are_shown_another_replay_as_often_as_said(demonstrations):
+    found, space = demonstrations
+    twins = [type(d)(d.state, d.command, "same") for d in (found[0], found[0])]
+    moved = twins[1].state.map(torch.clone)
+    moved.p[..., 0] += 0.1
+    twins[1] = type(found[0])(moved, twins[1].command, "same")
+    for share in (0.0, 1.0):
+        w = WindowSampler(twins, space, 30, (8, 24), siblings=share).sample(64, np.random.default_rng(0))
+        differ = ((w.state.p - w.shown.p).abs().amax((1, 2, 3)) > 0.05).float().mean()
+        assert differ == 0 if share == 0 else 0.3 < differ < 0.7  # one of two is itself
+
+
+def test_pushed_starts_are_those_in_which_nothing_stirs():
+    from intabs.model.space import State
+    from intabs.train.objective import FLIPPED, pushed
+
+    n = 4000
+    s = State(torch.zeros(n, 30, 7), torch.zeros(n, 30, 4, 3), torch.eye(3).expand(n, 30, 4, 3, 3), torch.zeros(n,
+              30, 0), torch.ones(n, 30, 4), torch.ones(n, 30, 4))  # fmt: skip
+    s.p[: n // 2, 10:, 1, 2] = 0.02
+    push, flip = pushed(s, 0.02, 20, np.random.default_rng(0))
+    assert not push[: n // 2].any() and (flip[: n // 2] == 1).all()
+    some = push[n // 2 :].abs().amax(1) > 0
+    assert 0.45 < some.float().mean() < 0.55 and abs(push[n // 2 :][some].std() - 0.02) < 0.001
+    assert abs((flip[n // 2 :] < 0).float().mean() - FLIPPED) < 0.015
+
+
 def test_disturbances_are_as_large_as_said(demonstrations):
     found, space = demonstrations
     s = WindowSampler(found, space, 30, (8, 24)).sample(64, np.random.default_rng(0)).state
@@ -301,8 +346,6 @@ def test_exported_weights_give_the_same_numbers_in_cpp(data, tmp_path):
     assert verify(out) == figures["max_abs_error"]
     errors = [figures["formats"][form]["rms_rad"] for form in ("fp32", "16", "8")]
     assert errors[0] < 1e-6 and errors[0] < errors[1] and errors[0] < errors[2] < 1e-3
-    plan = json.loads((out / "plans" / "pick_place.json").read_text())
-    assert plan["task"] == "pick_place" and all(len(s["z"]) == 16 for s in plan["skills"])
     # The golden vectors can tell: other weights do not pass.
     golden = json.loads((out / "golden.json").read_text())
     golden["pi"]["heads"]["agent"][0][0] += 1e-3
@@ -361,3 +404,27 @@ def test_evaluate_compares_kinds_of_runs_and_names_what_is_missing(data, tmp_pat
         evaluate(runs[:1], data, ["tvi"], "segment")
     with pytest.raises(UserError, match="known are"):
         evaluate(runs[:1], data, ["magic"], "segment")
+
+
+def test_the_table_trains_what_is_missing_and_compares_all_kinds(data, tmp_path):
+    command = [sys.executable, "-m", "intabs.evaluate.table", "--data", f"few={data}", "--seeds", "1"]
+    command += ["--runs", str(tmp_path), "--json", str(tmp_path / "t.json")]
+    command += [
+        x for s in ("train.steps=2", "train.batch=4", "train.warmup=1", "objective.window=30") for x in ("--set", s)
+    ]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, timeout=500)
+    assert done.returncode == 0, done.stderr
+    for method in ("intabs", "tvi", "tvi-agent", "pca", "still", "mean", "hdmp-faithful"):
+        assert f"| {method} |" in done.stdout
+    assert "4 demonstrations, 1 held out, 1 seed" in done.stdout and "A handful of demonstrations" in done.stdout
+    figures = json.loads((tmp_path / "t.json").read_text())["few"]
+    assert set(figures["segment"]["ratios"]) >= {"tvi", "tvi-agent", "pca"}
+    # A second time nothing is trained.
+    times = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("checkpoint.pt")}
+    assert (
+        len(times) == 3 and subprocess.run(command, capture_output=True, env=environment, timeout=500).returncode == 0
+    )
+    assert times == {p: p.stat().st_mtime_ns for p in tmp_path.rglob("checkpoint.pt")}
+    wrong = subprocess.run([*command[:3], "--data", "x=nowhere.hdf5"], capture_output=True, text=True, env=environment)
+    assert wrong.returncode == 1 and wrong.stderr.strip().count("\n") == 0 and "NAME=FILE" in wrong.stderr

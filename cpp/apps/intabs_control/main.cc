@@ -15,6 +15,7 @@
 #include "intabs/rt/stop_signal.h"
 #include "intabs/rt/tick_stats.h"
 #include "intabs/skills/skill_controller.h"
+#include "intabs/skills/skill_library.h"
 #include "plan_receiver.h"
 
 namespace intabs {
@@ -39,6 +40,7 @@ const char* Describe(EndReason reason) {
     case EndReason::kAborted: return "aborted";
     case EndReason::kStalePoses: return "object poses are older than 2.5 s: is perception running?";
     case EndReason::kBadInput: return "a reading or the policy's output is not finite";
+    case EndReason::kNoEffect: return "an object did not move as in the demonstration, however often it was tried";
     case EndReason::kRefused: return "the driver is in fault, stopped, or obeys another session";
     default: return "";
   }
@@ -49,10 +51,12 @@ class Control {
   explicit Control(const Options& options)
       : options_(options),
         bus_(options.lcm, options.prefix),
-        controller_(Policy::Load(options.weights, ArmModel::Lite6()), RandomSession()) {
+        controller_(SkillPlayer::Load(options.weights, ArmModel::Lite6()), RandomSession()),
+        library_(LoadSkillLibrary(options.weights)) {
     if (!options.hand_eye.empty()) X_BW_ = LoadHandEye(options.hand_eye).Inverse();
     bus_.Subscribe(kLite6Status, std::function<void(const ArmStatus&)>([this](const ArmStatus& s) { OnStatus(s); }));
     bus_.Subscribe(kSkillPlan, std::function<void(const SkillPlan&)>([this](const SkillPlan& p) { OnPlan(p); }));
+    bus_.Subscribe(kSkillControl, std::function<void(const SkillControl&)>([this](const SkillControl& c) { OnControl(c); }));
     // PLANT_TRUTH is listened to under --perception truth alone.
     if (options.perception == "truth") {
       bus_.Subscribe(kPlantTruth, std::function<void(const PlantTruth&)>([this](const PlantTruth& t) {
@@ -120,16 +124,23 @@ class Control {
       PublishSkillStatus();  // a re-send: the sender has not heard us
       return;
     }
-    if (!plan_.Add(part)) return;
+    if (!plan_.Add(part, library_)) return;
     if (controller_.Start(plan_.id(), plan_.skills()) != Status::kOk) {
-      std::fprintf(stderr, "intabs_control: plan %ld refused: %zu skills; it needs 1 to %d, each lasting 1 tick or more\n",
-                   static_cast<long>(plan_.id()), plan_.skills().size(), kMaxSkills);
+      std::fprintf(stderr,
+                   "intabs_control: plan %ld refused: %zu skills; it needs 1 to %d, each lasting 1 tick or more, of a library of %zu\n",
+                   static_cast<long>(plan_.id()), plan_.skills().size(), kMaxSkills, library_.size());
       return;
     }
     started_ = true;
     said_ = false;
     started_us_ = heard_us_ = MonotonicUs();
     PublishSkillStatus();
+  }
+
+  void OnControl(const SkillControl& c) {
+    if (c.plan_id != controller_.player().status().plan_id) return;
+    if (c.action == SkillControl::kAbort) controller_.Abort(EndReason::kAborted);
+    controller_.Pause(c.action == SkillControl::kPause);
   }
 
   // One policy tick and its answer.
@@ -229,7 +240,10 @@ class Control {
     m.skill_index = p.skill_index;
     m.n_skills = p.n_skills;
     m.progress = p.progress;
+    m.b_probability = p.b;
     m.infer_us = controller_.player().policy().infer_us();
+    m.skill_end = static_cast<int8_t>(p.skill_end);
+    m.retries = static_cast<int8_t>(p.retries);
     m.end_reason = static_cast<int8_t>(p.end_reason);
     bus_.Publish(kSkillStatus, m);
   }
@@ -260,6 +274,7 @@ class Control {
   const Options options_;
   LcmBus bus_;
   SkillController controller_;
+  const std::vector<Skill> library_;
   PlanReceiver plan_;
   Newest<ArmStatus> status_;
   std::optional<ObjectPoses> poses_;  // in the arm's base

@@ -33,6 +33,7 @@ inline const Channel<ObjectPoses> kObjectPoses{"OBJECT_POSES"};
 inline const Channel<PerceptionStatus> kPerceptionStatus{"PERCEPTION_STATUS"};
 inline const Channel<SkillPlan> kSkillPlan{"SKILL_PLAN"};
 inline const Channel<SkillStatus> kSkillStatus{"SKILL_STATUS"};
+inline const Channel<SkillControl> kSkillControl{"SKILL_CONTROL"};
 inline const Channel<LoopStatus> kLoopStatus{"LOOP_STATUS"};
 inline const Channel<PlantTruth> kPlantTruth{"PLANT_TRUTH"};
 inline const Channel<PlantControl> kPlantControl{"PLANT_CONTROL"};

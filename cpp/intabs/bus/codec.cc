@@ -18,6 +18,7 @@
 #include "intabs_lcm/plant_truth_t.hpp"
 #include "intabs_lcm/reset_t.hpp"
 #include "intabs_lcm/skill_plan_t.hpp"
+#include "intabs_lcm/skill_control_t.hpp"
 #include "intabs_lcm/skill_status_t.hpp"
 #include "intabs_lcm/tag_detections_t.hpp"
 
@@ -308,6 +309,8 @@ void ToLcm(const SkillStatus& m, intabs_lcm::skill_status_t& l) {
   l.b_probability = m.b_probability;
   l.infer_us = m.infer_us;
   l.end_reason = m.end_reason;
+  l.skill_end = m.skill_end;
+  l.retries = m.retries;
 }
 bool FromLcm(const intabs_lcm::skill_status_t& l, SkillStatus& m) {
   m.utime = l.utime;
@@ -319,7 +322,23 @@ bool FromLcm(const intabs_lcm::skill_status_t& l, SkillStatus& m) {
   m.b_probability = l.b_probability;
   m.infer_us = l.infer_us;
   m.end_reason = l.end_reason;
+  m.skill_end = l.skill_end;
+  m.retries = l.retries;
   return Finite(m.progress, m.b_probability, m.infer_us);
+}
+
+void ToLcm(const SkillControl& m, intabs_lcm::skill_control_t& l) {
+  l.utime = m.utime;
+  l.seq = m.seq;
+  l.plan_id = m.plan_id;
+  l.action = m.action;
+}
+bool FromLcm(const intabs_lcm::skill_control_t& l, SkillControl& m) {
+  m.utime = l.utime;
+  m.seq = l.seq;
+  m.plan_id = l.plan_id;
+  m.action = l.action;
+  return m.action >= SkillControl::kResume && m.action <= SkillControl::kAbort;
 }
 
 void ToLcm(const LoopStatus& m, intabs_lcm::loop_status_t& l) {
@@ -495,6 +514,8 @@ struct Wire<PlantTruth> : PlainWire<intabs_lcm::plant_truth_t> {};
 template <>
 struct Wire<SkillStatus> : PlainWire<intabs_lcm::skill_status_t> {};
 template <>
+struct Wire<SkillControl> : PlainWire<intabs_lcm::skill_control_t> {};
+template <>
 struct Wire<PerceptionStatus> : PlainWire<intabs_lcm::perception_status_t> {};
 template <>
 struct Wire<HandKeypoints> : PlainWire<intabs_lcm::hand_keypoints_t> {};
@@ -539,6 +560,7 @@ INTABS_MESSAGE(PlantTruth)
 INTABS_MESSAGE(TagDetections)
 INTABS_MESSAGE(SkillPlan)
 INTABS_MESSAGE(SkillStatus)
+INTABS_MESSAGE(SkillControl)
 INTABS_MESSAGE(LoopStatus)
 INTABS_MESSAGE(PerceptionStatus)
 INTABS_MESSAGE(HandKeypoints)

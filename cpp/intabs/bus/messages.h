@@ -43,6 +43,16 @@ struct SkillStatus {
   float b_probability = 0;  // that the running skill ends now
   float infer_us = 0;       // pi alone
   int8_t end_reason = 0;    // skills/skill_player.h EndReason
+  int8_t skill_end = 0;     // skills/skill_player.h SkillEnd
+  int8_t retries = 0;
+};
+
+struct SkillControl {
+  static constexpr int8_t kResume = 0, kPause = 1, kAbort = 2;
+  int64_t utime = 0;
+  int64_t seq = 0;
+  int64_t plan_id = 0;  // the one that is meant
+  int8_t action = kResume;
 };
 
 struct LoopStatus {

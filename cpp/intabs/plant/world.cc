@@ -222,6 +222,24 @@ void World::Place(const std::vector<Pose>& poses) {
   }
 }
 
+void World::Nudge(int slot, const Eigen::Vector3d& dp_W) {
+  const mjModel* m = model_.get();
+  mjData* d = data_.get();
+  for (const TaskObject& o : task_->objects()) {
+    if (o.slot != slot) continue;
+    const int body = mj_name2id(m, mjOBJ_BODY, o.body.c_str());
+    const int placed = o.base.empty() ? body : mj_name2id(m, mjOBJ_BODY, o.base.c_str());
+    if (IsFree(m, body)) {
+      mju_addTo3(d->qpos + m->jnt_qposadr[m->body_jntadr[body]], dp_W.data());
+    } else {
+      mju_addTo3(d->mocap_pos + 3 * m->body_mocapid[placed], dp_W.data());
+    }
+    mj_forward(m, d);
+    return;
+  }
+  throw std::runtime_error("no object in slot " + std::to_string(slot) + " to nudge");
+}
+
 // Beads in layers on the floor of a vessel: rings about its axis, not yet at rest.
 void World::FillVessel(int site) {
   const mjModel* m = model_.get();

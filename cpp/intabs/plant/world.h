@@ -57,6 +57,10 @@ class World {
   // Throws if spread_cm is not within 0 .. kMaxSpread.
   void Reset(int64_t seed, double spread_cm);
 
+  // Moves the object of a slot by dp_W [m] at once, as a hand that knocks against it; furniture stands elsewhere then.
+  // Throws if the task has no object there.
+  void Nudge(int slot, const Eigen::Vector3d& dp_W);
+
   // One driver tick: 4 ms, gravity compensated servos. Throws when the target is not finite or the
   // simulation breaks down.
   void Step(const ServoTarget& target);

@@ -32,6 +32,8 @@ class ArmSim {
     return controller_.Accept(command, now_us);
   }
 
+  void Nudge(int slot, const Eigen::Vector3d& dp_W) { world_.Nudge(slot, dp_W); }
+
   // One driver tick of 4 ms: the filter's step, then the world's. Watchdogs see the time at its end.
   void Tick() { Tick(world_.time_us() + kDriverPeriodUs); }
   void Tick(int64_t now_us);

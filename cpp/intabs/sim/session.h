@@ -24,6 +24,9 @@ class Session {
   // Answers the current policy tick and goes on to the next one, 40 ms later.
   Refusal Advance(const ArmCommand& command);
 
+  // See World::Nudge.
+  void Nudge(int slot, const Eigen::Vector3d& dp_W) { sim_.Nudge(slot, dp_W); }
+
   const ArmStatus& status() const { return status_; }
   const ObjectPoses& poses() const { return poses_; }
   const World& world() const { return sim_.world(); }

@@ -5,6 +5,8 @@
 #include <cmath>
 #include <stdexcept>
 
+#include "intabs/core/pose.h"
+
 namespace intabs {
 namespace {
 
@@ -25,13 +27,13 @@ void Demand(bool ok, const std::string& dir, const std::string& what) {
   if (!ok) throw std::runtime_error(dir + "/manifest.json: " + what);
 }
 
+constexpr float kSquash = 8.f;  // predicted changes saturate at so many of their training deviations
+
+float Squash(float x) { return kSquash * std::tanh(x / kSquash); }
+
 }  // namespace
 
-Policy Policy::Load(const std::string& dir, const ArmModel& arm, const NetworkOptions& options) {
-  return FromWeights(WeightsFile::Load(dir), arm, options);
-}
-
-Policy Policy::FromWeights(const WeightsFile& weights, const ArmModel& arm, const NetworkOptions& options) {
+PolicyCodec::PolicyCodec(const WeightsFile& weights, const ArmModel& arm, const Network& pi) : arm_(arm) {
   const std::string& dir = weights.label();
   const Manifest& manifest = weights.manifest();
   const std::string layout = manifest.Text("/state_layout");
@@ -39,61 +41,111 @@ Policy Policy::FromWeights(const WeightsFile& weights, const ArmModel& arm, cons
   const int64_t period = manifest.Integer("/policy_period_us");
   Demand(period == kPolicyPeriodUs, dir,
          "policy period " + std::to_string(period) + " us, this program runs at " + std::to_string(kPolicyPeriodUs));
-  Policy policy(arm, Network(weights, "pi", options));
-  const NetworkSpec& spec = manifest.network("pi");
-  policy.with_phase_ = spec.input == kPolicyInputDim;
-  Demand(policy.with_phase_ || spec.input == kStateDim + kLatentDim, dir,
-         "pi takes " + std::to_string(spec.input) + " inputs, the state layout, z and the phase give " +
+  Demand(pi.input_size() == kPolicyInputDim, dir,
+         "pi takes " + std::to_string(pi.input_size()) + " inputs, the state layout, z and the phase give " +
              std::to_string(kPolicyInputDim));
-  policy.agent_head_ = policy.pi_.HeadIndex("agent");
-  policy.environment_head_ = policy.pi_.HeadIndex("environment");
-  Demand(policy.pi_.head_size(policy.agent_head_) == kAgentActionDim &&
-             policy.pi_.head_size(policy.environment_head_) == kEnvironmentActionDim,
-         dir, "pi's heads must be agent (7) and environment (24)");
-  policy.normalizer_.mean = ReadVector<StateVector>(manifest, dir, "/normalizer/state_mean");
+  const auto head = [&](const char* name, int size) {
+    Demand(pi.HasHead(name) && pi.head_size(pi.HeadIndex(name)) == size, dir,
+           std::string("pi needs a head \"") + name + "\" of " + std::to_string(size) + " values; export the weights again");
+    return pi.HeadIndex(name);
+  };
+  agent_head = head("agent", kAgentActionDim);
+  environment_head = head("environment", kEnvironmentActionDim);
+  response_head = head("response", kNumJoints);
+  carried_head = head("carried", kMaxObjects);
+  normalizer_.mean = ReadVector<StateVector>(manifest, dir, "/normalizer/state_mean");
   const StateVector scale = ReadVector<StateVector>(manifest, dir, "/normalizer/state_scale");
   Demand((scale.array() > 0).all(), dir, "/normalizer/state_scale must be positive");
-  policy.normalizer_.inverse_scale = scale.cwiseInverse();
-  Demand((policy.normalizer_.inverse_scale.array() > 0).all() && policy.normalizer_.inverse_scale.allFinite(), dir,
+  normalizer_.inverse_scale = scale.cwiseInverse();
+  Demand((normalizer_.inverse_scale.array() > 0).all() && normalizer_.inverse_scale.allFinite(), dir,
          "/normalizer/state_scale holds a number that is too large or too small");
-  policy.normalizer_.limit = static_cast<float>(manifest.Number("/normalizer/limit"));
-  Demand(policy.normalizer_.limit > 0, dir, "/normalizer/limit must be positive");
-  policy.agent_scale_ =
-      ReadVector<Eigen::Matrix<float, kAgentActionDim, 1>>(manifest, dir, "/normalizer/agent_action_scale");
-  policy.environment_scale_ =
-      ReadVector<Eigen::Matrix<float, kEnvironmentActionDim, 1>>(manifest, dir, "/normalizer/environment_action_scale");
-  Demand((policy.agent_scale_.array() > 0).all() && (policy.environment_scale_.array() > 0).all(), dir,
-         "/normalizer/agent_action_scale and environment_action_scale must be positive");
+  normalizer_.limit = static_cast<float>(manifest.Number("/normalizer/limit"));
+  Demand(normalizer_.limit > 0, dir, "/normalizer/limit must be positive");
+  agent_scale_ = ReadVector<decltype(agent_scale_)>(manifest, dir, "/normalizer/agent_action_scale");
+  response_scale_ = ReadVector<decltype(response_scale_)>(manifest, dir, "/normalizer/response_scale");
+  environment_scale_ = ReadVector<decltype(environment_scale_)>(manifest, dir, "/normalizer/environment_action_scale");
+  Demand((agent_scale_.array() > 0).all() && (environment_scale_.array() > 0).all() && (response_scale_.array() > 0).all(),
+         dir, "/normalizer/agent_action_scale, environment_action_scale and response_scale must be positive");
   // A step of a radian a tick is ten times what the arm can do: such weights are broken.
-  Demand((policy.agent_scale_.head<kNumJoints>().array() < 1).all(), dir,
+  Demand((agent_scale_.head<kNumJoints>().array() < 1).all(), dir,
          "/normalizer/agent_action_scale holds a joint step of 1 rad a tick or more");
-  return policy;
 }
 
-Status Policy::Step(const Observation& observation, const LatentVector& z, float phase, Action& action) noexcept {
-  StateVector s;
+Status PolicyCodec::Sense(const Observation& observation, StateVector& s) const noexcept {
   if (const Status status = AssembleState(arm_, observation, s); status != Status::kOk) return status;
   normalizer_.Apply(s);
-  input_.head<kStateDim>() = s;
-  if (with_phase_) {
-    input_.segment<kLatentDim>(kStateDim + kPhaseBasis) = z;
-    for (int k = 0; k < kPhaseBasis; ++k) {
-      const float b = std::max(0.f, 1.f - std::abs(phase * (kPhaseBasis - 1) - static_cast<float>(k)));
-      input_[kStateDim + k] = b;
-      input_.segment<kLatentDim>(kStateDim + kPhaseBasis + kLatentDim * (1 + k)) = b * z;
-    }
-  } else {
-    input_.segment<kLatentDim>(kStateDim) = z;
+  return Status::kOk;
+}
+
+void PolicyCodec::Encode(const StateVector& s, const LatentVector& z, float phase, float* x) const noexcept {
+  Eigen::Map<Eigen::Matrix<float, kPolicyInputDim, 1>> input(x);
+  input.head<kStateDim>() = s;
+  input.segment<kLatentDim>(kStateDim + kPhaseBasis) = z;
+  for (int k = 0; k < kPhaseBasis; ++k) {
+    const float b = std::max(0.f, 1.f - std::abs(phase * (kPhaseBasis - 1) - static_cast<float>(k)));
+    input[kStateDim + k] = b;
+    input.segment<kLatentDim>(kStateDim + kPhaseBasis + kLatentDim * (1 + k)) = b * z;
   }
+}
+
+Status PolicyCodec::Decode(const Observation& observation, const Heads& heads, Action& action) const noexcept {
+  for (int i = 0; i < kNumJoints; ++i) {
+    action.dq_step[i] = heads.agent[i] * agent_scale_[i];
+    action.response[i] = Squash(heads.response[i]) * response_scale_[i];
+  }
+  action.gripper_closed = heads.agent[kNumJoints] > 0.f;
+  const Pose X_WG = arm_.Tip(observation.q);
+  const Pose X_WG_next = arm_.Tip(observation.q + action.response);
+  for (int i = 0; i < kMaxObjects; ++i) {
+    auto motion = action.object_motion.segment<kObjectMotionDim>(kObjectMotionDim * i);
+    for (int k = 0; k < kObjectMotionDim; ++k) {
+      const int at = kObjectMotionDim * i + k;
+      motion[k] = Squash(heads.environment[at]) * environment_scale_[at];
+    }
+    // Truly 0 or 1 where pi is sure: a far object must not stir.
+    action.held[i] = std::clamp(1.2f / (1.f + std::exp(-heads.carried[i])) - 0.1f, 0.f, 1.f);
+    const TrackedObject& o = observation.objects[i];
+    if (o.id < 0) {
+      motion.setZero();
+    } else {
+      motion += action.held[i] * ObjectMotion(X_WG, o.X_WO, X_WG_next * X_WG.Inverse() * o.X_WO);
+    }
+  }
+  return action.dq_step.allFinite() && action.response.allFinite() && action.object_motion.allFinite() ? Status::kOk
+                                                                                                       : Status::kInvalidInput;
+}
+
+void PolicyCodec::Advance(const Action& action, Observation& observation) const noexcept {
+  const Pose X_WG = arm_.Tip(observation.q);
+  for (int i = 0; i < kMaxObjects; ++i) {
+    TrackedObject& o = observation.objects[i];
+    if (o.id < 0) continue;
+    const auto motion = action.object_motion.segment<kObjectMotionDim>(kObjectMotionDim * i).cast<double>();
+    o.X_WO.p += X_WG.q * motion.head<3>();
+    o.X_WO.q = (ExpSO3(X_WG.q * motion.tail<3>()) * o.X_WO.q).normalized();
+  }
+  observation.q += action.response;
+  observation.gripper_closed = action.gripper_closed;
+}
+
+Policy Policy::Load(const std::string& dir, const ArmModel& arm, const NetworkOptions& options) {
+  return FromWeights(WeightsFile::Load(dir), arm, options);
+}
+
+Policy Policy::FromWeights(const WeightsFile& weights, const ArmModel& arm, const NetworkOptions& options) {
+  return Policy(weights, arm, Network(weights, "pi", options));
+}
+
+Status Policy::Step(const Observation& observation, const StateVector& s, const LatentVector& z, float phase,
+                    Action& action) noexcept {
+  codec_.Encode(s, z, phase, input_.data());
   const auto before = std::chrono::steady_clock::now();
   if (const Status status = pi_.Step(input_.data()); status != Status::kOk) return status;
   infer_us_ = std::chrono::duration<float, std::micro>(std::chrono::steady_clock::now() - before).count();
-  const auto agent = pi_.Head(agent_head_);
-  const auto environment = pi_.Head(environment_head_);
-  for (int i = 0; i < kNumJoints; ++i) action.dq_step[i] = agent[i] * agent_scale_[i];
-  action.gripper_closed = agent[kNumJoints] > 0.f;
-  for (int i = 0; i < kEnvironmentActionDim; ++i) action.object_motion[i] = environment[i] * environment_scale_[i];
-  return action.dq_step.allFinite() && action.object_motion.allFinite() ? Status::kOk : Status::kInvalidInput;
+  return codec_.Decode(observation,
+                       {pi_.Head(codec_.agent_head).data(), pi_.Head(codec_.environment_head).data(),
+                        pi_.Head(codec_.response_head).data(), pi_.Head(codec_.carried_head).data()},
+                       action);
 }
 
 }  // namespace intabs

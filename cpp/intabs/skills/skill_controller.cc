@@ -17,8 +17,8 @@ Status SkillController::Tick(const ArmStatus& status, const ObjectPoses& poses, 
   command.status_seq = status.seq;
   command.q_target = status.q_commanded;
   Status result = Status::kNotReady;
-  if (player_.playing() && pose_age_us > kMaxPoseAgeUs) {
-    // The plan goes on when there are newer ones; until then nobody moves blindly.
+  if (player_.playing() && (paused_ || pose_age_us > kMaxPoseAgeUs)) {
+    // With old poses the plan goes on when there are newer ones; until then nobody moves blindly.
   } else if (player_.playing()) {
     Observation observation;
     observation.q = status.q;

@@ -12,10 +12,16 @@ inline constexpr int64_t kPosesGoneUs = 2500000;   // ... and from here on it en
 class SkillController {
  public:
   // session: random, > 0; names this controller to the driver.
-  SkillController(Policy policy, int64_t session) : player_(std::move(policy)), session_(session) {}
+  SkillController(SkillPlayer player, int64_t session) : player_(std::move(player)), session_(session) {}
 
-  Status Start(int64_t plan_id, std::span<const Skill> skills) noexcept { return player_.Start(plan_id, skills); }
+  Status Start(int64_t plan_id, std::span<const Skill> skills) noexcept {
+    paused_ = false;
+    return player_.Start(plan_id, skills);
+  }
   void Abort(EndReason why) noexcept { player_.Abort(why); }
+  // While paused the arm holds and the plan waits.
+  void Pause(bool on) noexcept { paused_ = on; }
+  bool paused() const noexcept { return paused_; }
 
   // Real-time safe. Always fills a command that is safe to send: while nothing is played it asks the driver to hold.
   // Returns what the player said. While poses are older than kMaxPoseAgeUs the arm is asked to hold and the plan waits
@@ -32,6 +38,7 @@ class SkillController {
   int64_t session_;
   int64_t seq_ = 0;
   bool gripper_closed_ = false;
+  bool paused_ = false;
 };
 
 }  // namespace intabs

@@ -1,25 +1,35 @@
 #include "intabs/skills/skill_player.h"
 
+#include <algorithm>
+#include <functional>
+#include <limits>
+
+#include "intabs/core/pose.h"
+
 namespace intabs {
 
 namespace {
 
-// The skill is expected to last the mean of its bounds.
-float Phase(const Skill& skill, int tick) {
-  const int last = (skill.min_ticks + skill.max_ticks) / 2 - 1;
-  return last < 1 || tick >= last ? (tick > 0 ? 1.f : 0.f) : static_cast<float>(tick) / static_cast<float>(last);
-}
+bool Rested(const SkillRecord& record) { return std::all_of(record.rested.begin(), record.rested.end(), std::identity{}); }
 
 }  // namespace
+
+SkillPlayer SkillPlayer::Load(const std::string& dir, const ArmModel& arm, const NetworkOptions& options) {
+  const WeightsFile weights = WeightsFile::Load(dir);
+  return {Policy::FromWeights(weights, arm, options), Termination(weights, options)};
+}
 
 Status SkillPlayer::Start(int64_t plan_id, std::span<const Skill> skills) noexcept {
   if (skills.empty() || skills.size() > kMaxSkills) return Status::kOutOfRange;
   for (const Skill& s : skills) {
     if (s.min_ticks < 1 || s.max_ticks < s.min_ticks || s.max_ticks > kMaxSkillTicks || !s.z.allFinite()) return Status::kOutOfRange;
   }
+  at_rest_ = !playing();
   std::copy(skills.begin(), skills.end(), skills_.begin());
-  status_ = {plan_id, 0, static_cast<int>(skills.size()), 0.f, EndReason::kRunning};
-  tick_ = 0;
+  status_ = PlayerStatus{};
+  status_.plan_id = plan_id;
+  status_.n_skills = static_cast<int>(skills.size());
+  status_.end_reason = EndReason::kRunning;
   first_ = true;
   return Status::kOk;
 }
@@ -28,22 +38,115 @@ void SkillPlayer::Abort(EndReason why) noexcept {
   if (playing()) status_.end_reason = why;
 }
 
+// pi and eta are trained on skills that start from a zero state.
+void SkillPlayer::Begin(int skill, SkillEnd why, const Observation& observation) noexcept {
+  status_.skill_index = skill;
+  status_.skill_end = why;
+  status_.progress = 0;
+  tick_ = 0;
+  policy_.Reset();
+  termination_.Reset();
+  for (int i = 0; i < kMaxObjects; ++i) {
+    if (!skills_[skill].record.rested[i]) continue;
+    before_[i] = observation.objects[i];
+    moved_[i] = 0;
+  }
+}
+
+// What is not seen is not judged.
+void SkillPlayer::Watch(const Observation& observation) noexcept {
+  for (int i = 0; i < kMaxObjects; ++i) {
+    const TrackedObject &was = before_[i], &is = observation.objects[i];
+    if (was.id < 0 || !was.valid || !is.valid) continue;
+    const double d = (is.X_WO.p - was.X_WO.p).norm() + kTurnLength * AngleBetween(was.X_WO.q, is.X_WO.q);
+    moved_[i] = std::max(moved_[i], static_cast<float>(d));
+  }
+}
+
+// The slot that did not move as recorded, or -1.
+int SkillPlayer::Missing(const SkillRecord& record, const Observation& observation) const noexcept {
+  for (int i = 0; i < kMaxObjects; ++i) {
+    if (record.moved[i] <= kEffect || before_[i].id < 0 || !before_[i].valid || !observation.objects[i].valid) continue;
+    if (moved_[i] < kEffectShare * record.moved[i]) return i;
+  }
+  return -1;
+}
+
+// Of the skills before the object began to move, the one that began with the object as it is now, seen from the tip.
+int SkillPlayer::RetryFrom(int skill, int slot, const Observation& observation) const noexcept {
+  int last = skill;
+  while (last > 0 && !Rested(skills_[last].record)) --last;
+  int first = last;
+  while (first > 0 && Rested(skills_[first - 1].record)) --first;
+  const Pose X_WG = policy_.codec().arm().Tip(observation.q);
+  const Eigen::Vector3f p_GO = (X_WG.Inverse() * observation.objects[slot].X_WO).p.cast<float>();
+  int best = first;
+  float nearest = std::numeric_limits<float>::max();
+  for (int k = first; k <= last; ++k) {
+    const SkillRecord& record = skills_[k].record;
+    if (record.gripper_closed != skills_[first].record.gripper_closed) break;  // the grasp itself comes too late
+    if (const float d = (record.p_GO[slot] - p_GO).norm(); d < nearest) {
+      nearest = d;
+      best = k;
+    }
+  }
+  return best;
+}
+
+// The running skill is over.
+void SkillPlayer::GoOn(SkillEnd why, const Observation& observation) noexcept {
+  if (const int slot = Missing(skills_[status_.skill_index].record, observation); slot >= 0) {
+    if (status_.retries == kMaxRetries) {
+      status_.end_reason = EndReason::kNoEffect;
+      return;
+    }
+    ++status_.retries;
+    Begin(RetryFrom(status_.skill_index, slot, observation), SkillEnd::kNoEffect, observation);
+  } else if (status_.skill_index + 1 == status_.n_skills) {
+    status_.end_reason = EndReason::kFinished;
+    status_.skill_end = why;
+  } else {
+    Begin(status_.skill_index + 1, why, observation);
+  }
+}
+
 Status SkillPlayer::Tick(const Observation& observation, const JointVector& q_commanded, JointVector& q_target,
                          bool& gripper_closed) noexcept {
   if (status_.end_reason == EndReason::kFinished) return Status::kFinished;
   if (!playing()) return Status::kNotReady;
-  if (first_) {
-    q_target_ = q_commanded;
-    gripper_closed_ = observation.gripper_closed;
-    first_ = false;
-  }
-  if (tick_ == 0) policy_.Reset();  // trained on segments that start from a zero state
-  Action action;
-  const Skill& skill = skills_[status_.skill_index];
-  const Status status = policy_.Step(observation, skill.z, Phase(skill, tick_), action);
-  if (status != Status::kOk) {
+  const auto fail = [this](Status status) {
     Abort(EndReason::kBadInput);
     return status;
+  };
+  StateVector s;
+  if (const Status status = policy_.codec().Sense(observation, s); status != Status::kOk) return fail(status);
+  if (first_) {
+    if (at_rest_) {
+      q_target_ = q_commanded;
+      gripper_closed_ = observation.gripper_closed;
+    }
+    first_ = false;
+    Begin(0, SkillEnd::kNone, observation);
+  }
+  Watch(observation);
+  if (tick_ > 0) {
+    const Skill& skill = skills_[status_.skill_index];
+    if (const Status status = termination_.Step(s, skill.z, tick_); status != Status::kOk) return fail(status);
+    if (tick_ >= skill.max_ticks) {
+      GoOn(SkillEnd::kLongest, observation);
+    } else if (tick_ >= skill.min_ticks && termination_.over()) {
+      GoOn(SkillEnd::kTerminated, observation);
+    }
+  }
+  if (status_.end_reason == EndReason::kFinished) return Status::kFinished;
+  if (!playing()) return Status::kNotReady;
+  const Skill& skill = skills_[status_.skill_index];
+  if (tick_ == 0) {
+    if (const Status status = termination_.Step(s, skill.z, 0); status != Status::kOk) return fail(status);
+  }
+  Action action;
+  if (const Status status = policy_.Step(observation, s, skill.z, SkillPhase(skill, tick_), action); status != Status::kOk) {
+    return fail(status);
   }
   if (!zero_actions_) {
     q_target_ += action.dq_step;
@@ -51,18 +154,9 @@ Status SkillPlayer::Tick(const Observation& observation, const JointVector& q_co
   }
   q_target = q_target_;
   gripper_closed = gripper_closed_;
-
   ++tick_;
-  status_.progress = static_cast<float>(tick_) / static_cast<float>(skills_[status_.skill_index].max_ticks);
-  if (tick_ >= skills_[status_.skill_index].max_ticks) {
-    if (status_.skill_index + 1 == status_.n_skills) {
-      status_.end_reason = EndReason::kFinished;
-    } else {
-      ++status_.skill_index;
-      tick_ = 0;
-      status_.progress = 0;
-    }
-  }
+  status_.b = termination_.b();
+  status_.progress = static_cast<float>(tick_) / static_cast<float>(skill.max_ticks);
   return Status::kOk;
 }
 

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from intabs.errors import UserError
-from intabs.output import write_json
+from intabs.output import Progress, write_json
 
 
 def register(app: typer.Typer) -> None:
@@ -19,14 +19,22 @@ def register(app: typer.Typer) -> None:
         trials: Annotated[
             int, typer.Option(help="Closed-loop runs for each weight format (fp32, 16, 8 bit); 0: none.", min=0)
         ] = 20,
+        practice: Annotated[
+            int,
+            typer.Option(
+                help="Tries of each demonstration in the plant: the library notes which do their task.", min=0
+            ),
+        ] = 6,
+        jobs: Annotated[int, typer.Option(help="Tries at a time.", min=1)] = 1,
         json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
     ) -> None:
-        """Write weights, manifest, golden vectors and plans; load them in C++ and compare before it counts as done."""
+        """Write weights, manifest, golden vectors and the skill library; done when C++ loads them and agrees."""
         try:
             from intabs.train.export import export as write
         except ModuleNotFoundError as e:
             raise UserError(f"{e.name} is not installed: run tools/setup (without --runtime-only)") from None
-        figures = write(run, out, trials)
+        with Progress("export", total=1.0) as progress:
+            figures = write(run, out, trials, practice, jobs, progress.update)
         write_json(json, figures)
         print(f"{out}: {figures['tensors']} tensors, C++ within {figures['max_abs_error']:.1e} of torch")
         for name, f in figures["formats"].items():

@@ -12,6 +12,11 @@ from intabs.commands.demo import Perception
 from intabs.output import Progress, write_json
 
 
+class Way(StrEnum):
+    whole = "whole"
+    goal = "goal"
+
+
 class Ablation(StrEnum):
     none = "none"
     objects = "objects"
@@ -36,7 +41,19 @@ def register(app: typer.Typer) -> None:
         ] = 1_000_000,
         jobs: Annotated[int, typer.Option(help="Trials at a time.", min=1)] = 1,
         resume: Annotated[bool, typer.Option("--resume", help="Keep the trials already in --report.")] = False,
-        report: Annotated[Path | None, typer.Option(help="Folder for trials.jsonl, one line a trial.")] = None,
+        report: Annotated[
+            Path | None,
+            typer.Option(help="Folder for trials.jsonl, figures.json, a picture strip of each failure, a plot."),
+        ] = None,
+        plan: Annotated[
+            Way | None,
+            typer.Option(
+                help="whole (single tasks): the demonstration that began most like now; goal (compositions): found."
+            ),
+        ] = None,
+        nudge: Annotated[
+            bool, typer.Option("--nudge", help="Knock the object away as the fingers first close.")
+        ] = False,
         ablate: Annotated[
             Ablation,
             typer.Option(help="objects: poses frozen at their first value; z: skills shuffled; policy: zeros for pi."),
@@ -46,10 +63,11 @@ def register(app: typer.Typer) -> None:
         """Closed-loop success in the plant: in process, in lockstep, with a 95 % interval."""
         from intabs.rollout import rollout as run
 
+        way = plan or (Way.goal if "+" in task else Way.whole)
         with Progress("rollout", total=trials) as progress:
             figures = run(
                 task, trials, spread, weights, perception.value, seed, jobs,
-                "" if ablate is Ablation.none else ablate.value, report, resume, progress.update,
+                "" if ablate is Ablation.none else ablate.value, report, resume, way.value, nudge, progress.update,
             )  # fmt: skip
         write_json(json, figures)
         low, high = figures["ci95"]

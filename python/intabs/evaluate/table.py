@@ -34,7 +34,7 @@ def train(config: str, data: Path, run: Path, seed: int, settings: list[str]) ->
     if (run / "checkpoint.pt").exists():
         command.append("--resume")
     print(f"{run}: training {config}, seed {seed}", flush=True)
-    if subprocess.run(command).returncode != 0:
+    if subprocess.run(command).returncode != 0 or not (run / "result.json").exists():
         raise UserError(f"{run}: training failed, see above")
 
 

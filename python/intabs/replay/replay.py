@@ -32,6 +32,9 @@ RETURN = 0.12  # of a disturbance, a tick, that the recorded commands take back
 MIN_SPREAD = 1.0  # cm
 REPLAY_SEEDS = 300000  # of the plant; evaluation uses others
 MAX_STEP = 0.08  # rad a tick (2 rad/s): a path that is faster is not tried
+ELSEWHERE = 0.5  # share of the replays that do not start at home: half of them where another demonstration ended,
+START_RAD = 0.15  # half of them so far from home (standard deviation, each joint)
+DRIVE_STEP = 0.03  # rad a tick, on the way to such a start
 
 
 @dataclass
@@ -94,6 +97,18 @@ def _progress(distance: np.ndarray, near: float) -> np.ndarray:
     return np.clip(gaussian_filter1d(w, SMOOTH), 0, 1)
 
 
+def started_at(start: np.ndarray, path: np.ndarray, about: Outline) -> np.ndarray:
+    """Joint targets (T, 6) that begin at `start`, or as far towards it as MAX_STEP allows, and join `path` on the
+    way to the object that will be moved."""
+    x = np.clip(about.to_mover / 0.8, 0, 1)[:, None]
+    offset = (1 - x * x * (3 - 2 * x)) * (start - path[0])
+    for share in (1.0, 0.75, 0.5, 0.25):
+        moved = path + share * offset
+        if np.abs(np.diff(moved, axis=0)).max() <= MAX_STEP:
+            return moved
+    return path
+
+
 def displacement(old: np.ndarray, new: np.ndarray) -> tuple[np.ndarray, float]:
     """Of an object's pose (7,) in the table's plane: where its place goes, p -> p_new + Rz(yaw)(p - p_old)."""
     R = Rotation.from_quat(np.roll(new[3:], -1)) * Rotation.from_quat(np.roll(old[3:], -1)).inv()
@@ -138,17 +153,24 @@ class Replayer:
             out.append(q)
         return np.stack(out)
 
-    def replay(self, demo: Demo, about: Outline, seed: int, spread_cm: float, disturb: float) -> Demo | str:
+    def replay(
+        self, demo: Demo, about: Outline, seed: int, spread_cm: float, disturb: float, start: np.ndarray | None = None
+    ) -> Demo | str:
         """One try with the objects where the plant puts them for this seed; the reason if it failed.
 
         disturb: standard deviation [rad] of pushes the commands get now and then and take back (Laskey et al., DART,
-        2017); what is recorded as the action takes back, it does not push."""
+        2017); what is recorded as the action takes back, it does not push. start: joints (6,) [rad] to begin at; None:
+        the recording's. The way there is not recorded."""
         session = self.session
         session.reset(seed, spread_cm)
         rng = np.random.default_rng(seed)
         path = self.commands(demo, about, session.observe()["object_pose"])
         if path is None:
             return "out of reach"
+        if start is not None:
+            path = started_at(start, path, about)
+            if not self.drive(path[0]):
+                return "start out of reach"
         rows, pushed, target = [], np.zeros(6), path[0].copy()
         for t, wanted in enumerate(path):
             o = session.observe()
@@ -170,6 +192,14 @@ class Replayer:
             return session.failure_reason.split(" [")[0]
         return Demo(*(np.array(x) for x in zip(*rows, strict=True)), {"seed": seed, "spread_cm": spread_cm})
 
+    def drive(self, to: np.ndarray) -> bool:
+        """Joint by joint in step, to rest there; whether the driver let it."""
+        o = self.session.observe()
+        q, gripper = np.asarray(o["q_commanded"]), bool(o["gripper_closed"])
+        steps = int(np.ceil(np.abs(to - q).max() / DRIVE_STEP)) + 1
+        way = [q + (to - q) * (k + 1) / steps for k in range(steps)] + [to] * 10
+        return all(self.session.command(target, gripper) == 0 for target in way)
+
 
 def pad_slots(demo: Demo) -> Demo:
     missing = OBJECT_SLOTS - demo.object_pose.shape[1]
@@ -186,6 +216,7 @@ class Try:
     seed: int
     spread_cm: float
     disturb: float
+    start: np.ndarray | None
 
 
 _replayers: dict[str, Replayer] = {}
@@ -199,7 +230,7 @@ def attempt(one: Try) -> tuple[Try, Demo | str]:
     about = outline(one.demo, _replayers[task].arm)
     if about is None:
         return one, "nothing is moved in the recording"
-    return one, _replayers[task].replay(one.demo, about, one.seed, one.spread_cm, one.disturb)
+    return one, _replayers[task].replay(one.demo, about, one.seed, one.spread_cm, one.disturb, one.start)
 
 
 def make(data: Path, out: Path, number: int, spread_cm: float, disturb: float, seed: int, jobs: int, progress) -> dict:
@@ -216,6 +247,13 @@ def make(data: Path, out: Path, number: int, spread_cm: float, disturb: float, s
     wanted = {task: number // len(by_task) + (i < number % len(by_task)) for i, task in enumerate(sorted(by_task))}
     figures = {task: {"demos": 0, "tries": 0, "failures": Counter()} for task in wanted}
     frames = done = 0
+    ends = np.array([demo.joint_pos[-1] for _, demo in recorded])
+
+    def start(demo: Demo, rng: np.random.Generator) -> np.ndarray | None:
+        kind, end, push = rng.random(), ends[rng.integers(len(ends))], START_RAD * rng.normal(size=6)
+        if kind > ELSEWHERE:
+            return None
+        return end if kind < 0.5 * ELSEWHERE else demo.joint_pos[0] + push
 
     def tries():
         # A source that cannot be replayed must not keep this going for ever.
@@ -225,7 +263,8 @@ def make(data: Path, out: Path, number: int, spread_cm: float, disturb: float, s
                 if figures[task]["demos"] >= wanted[task]:
                     break
                 name, demo = by_task[task][k % len(by_task[task])]
-                yield Try(name, demo, REPLAY_SEEDS + seed + k, float(rng.uniform(MIN_SPREAD, spread_cm)), disturb)
+                spread = float(rng.uniform(MIN_SPREAD, spread_cm))
+                yield Try(name, demo, REPLAY_SEEDS + seed + k, spread, disturb, start(demo, rng))
 
     with (
         DemoWriter(out, {**attrs, "task": "all", "replays_of": data.name}, 0.0) as writer,

@@ -1,4 +1,4 @@
-"""Checkpoint -> models/weights/NAME: weights.safetensors, manifest.json with golden vectors, plans/<task>.json.
+"""Checkpoint -> models/weights/NAME: weights.safetensors, manifest.json with golden vectors, skills.json.
 
 The C++ side loads what was written before the export counts as done, and must give the golden outputs.
 """
@@ -7,24 +7,29 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from intabs import _core
-from intabs.data.demos import Demo, load_demos
+from intabs.data.demos import OBJECT_SLOTS, Demo, load_demos
 from intabs.errors import UserError
 from intabs.evaluate.learned import Learned
 from intabs.evaluate.metrics import fixed_cuts, sample
+from intabs.jobs import in_processes
 from intabs.model.networks import InteractionAbstractions, phase, phase_basis
 from intabs.model.space import Space, state_of
 from intabs.rollout import UNSEEN, Setting, run_trial
-from intabs.train.trainer import load_model
+from intabs.skills.library import Library, entries
+from intabs.train.boundaries import Boundaries
+from intabs.train.trainer import load_model, load_named
 
 SCHEMA = 1
-SEGMENT = 14  # ticks of a skill of a plan
+SEGMENT = 14  # ticks of a skill on which the formats are compared
 GOLDEN_TICKS = 40
+PRACTICE_CM, PRACTICE_SEED = 3.0, 500_000
 TOLERANCE = 1e-5
 
 
@@ -49,32 +54,47 @@ def encode_demo(model: InteractionAbstractions, demo: Demo, cuts: list[int]) -> 
     return learned.encode(learned.inputs(sample(demo)), list(zip(cuts, cuts[1:], strict=False))).numpy()
 
 
-def typical_demo(demos: list[Demo]) -> int:
-    """The demonstration whose objects start nearest to the average place, among straight ones of average length."""
-    first = np.array([d.object_pose[np.argmax(d.object_valid.all(1)), :, :3].ravel() for d in demos])
-    lengths = np.array([len(d) for d in demos])
-    calm = np.array([d.attrs.get("disturb", 0.0) == 0 and d.attrs.get("detours", 0.0) == 0 for d in demos])
-    usual = np.median(lengths[calm]) if calm.any() else np.median(lengths)
-    near_length = np.abs(lengths - usual) <= 0.15 * usual
-    distance = np.linalg.norm(first - first.mean(0), axis=1)
-    return int(np.argmin(distance + 10.0 * ~near_length + 100.0 * ~calm))
+def library_of(model, demos: list[Demo], names: list[str], cuts: list[list[int]]) -> dict:
+    """skills.json: every skill of these demonstrations, cut at these ticks (skills/library.py)."""
+    arm, skills = _core.ArmModel.lite6(), []
+    for demo, name, at in zip(demos, names, cuts, strict=True):
+        known = np.maximum.accumulate(demo.object_valid.astype(bool), axis=0)
+        missing = OBJECT_SLOTS - known.shape[1]
+        known = np.pad(known, ((0, 0), (0, missing)))
+        pose = np.pad(demo.object_pose, ((0, 0), (0, missing), (0, 0)))
+        z, of = encode_demo(model, demo, at), (demo.joint_pos, demo.gripper > 0.5, pose, known)
+        skills += entries(str(demo.attrs["task"]), name, z, at, *of, arm)
+    return {"skills": skills, "practice": []}
 
 
-def make_plan(model, demo: Demo, segment: int, source: str) -> dict:
-    cuts = fixed_cuts(len(demo), segment + 1)
-    z = encode_demo(model, demo, cuts)
-    ticks = np.diff(cuts).tolist()
-    return {
-        "task": demo.attrs["task"],
-        "source_demo": source,
-        "skills": [
-            {"z": [float(v) for v in row], "min_ticks": n, "max_ticks": n} for row, n in zip(z, ticks, strict=True)
-        ],
-    }
+def write_library(out: Path, library: dict) -> None:
+    (out / "skills.json").write_text(json.dumps(library, separators=(",", ":")))
 
 
-def export(run: Path | str, out: Path | str, trials: int = 20) -> dict:
-    """Returns {sha256, tensors, max_abs_error, formats}. `trials`: closed-loop runs of each weight format, 0: none.
+def practise(out: Path, library: dict, trials: int, jobs: int, progress) -> list[int]:
+    """How often the skills of each demonstration do their task in the plant: truth, objects within PRACTICE_CM,
+    seeds of its own."""
+    write_library(out, library)
+    chains = list(Library.load(out).chains)
+    work = [(Setting(task, str(out), PRACTICE_CM, "truth", PRACTICE_SEED, "", source=source), i)
+            for task, source in sorted(chains) for i in range(trials)]  # fmt: skip
+    won = dict.fromkeys(chains, 0)
+    for done, ((setting, _), result) in enumerate(zip(work, in_processes(run_trial, work, jobs), strict=True)):
+        won[setting.task, setting.source] += result["success"]
+        progress(done / len(work), f"{setting.task}: {setting.source}")
+    return list(won.values())
+
+
+def export(
+    run: Path | str,
+    out: Path | str,
+    trials: int = 20,
+    practice: int = 0,
+    jobs: int = 1,
+    progress: Callable[[float, str], None] = lambda share, text: None,
+) -> dict:
+    """Returns {sha256, tensors, max_abs_error, formats}. `trials`: closed-loop runs of each weight format;
+    `practice`: of each demonstration's skills, for the library to know which do their task; 0: none.
     Raises UserError if C++ and torch disagree by more than 1e-5."""
     from safetensors.torch import save_file
 
@@ -82,7 +102,7 @@ def export(run: Path | str, out: Path | str, trials: int = 20) -> dict:
     if model.space.arm is None:
         raise UserError(f"{run}: was not trained on the Lite 6; only its weights run in C++")
     out = Path(out)
-    (out / "plans").mkdir(parents=True, exist_ok=True)
+    out.mkdir(parents=True, exist_ok=True)
     tensors = {
         f"{net}.{name}": value.float()
         for net, module in model.networks().items()
@@ -104,7 +124,6 @@ def export(run: Path | str, out: Path | str, trials: int = 20) -> dict:
         }
     (out / "golden.json").write_text(json.dumps(golden))
 
-    segment = SEGMENT
     manifest = {
         "schema_version": SCHEMA,
         "sha256": sha256,
@@ -123,12 +142,24 @@ def export(run: Path | str, out: Path | str, trials: int = 20) -> dict:
     }
     (out / "manifest.json").write_text(json.dumps(manifest, indent=1))
 
-    demos, _ = load_demos(checkpoint["data"]["path"], "train")
-    for task in sorted({d.attrs["task"] for d in demos}):
-        of_task = [d for d in demos if d.attrs["task"] == task]
-        k = typical_demo(of_task)
-        plan = make_plan(model, of_task[k], segment, f"seed {of_task[k].attrs.get('seed')}")
-        (out / "plans" / f"{task}.json").write_text(json.dumps(plan, indent=1))
+    demos, names = load_named(checkpoint["data"]["path"], "train")
+    boundaries = Boundaries(
+        model.space, [state_of(d)[0] for d in demos], checkpoint["config"]["objective"]["boundaries"]
+    )
+    cuts = [boundaries.cuts(state_of(d)[0]).tolist() for d in demos]
+    even = [fixed_cuts(len(d), SEGMENT + 1) for d in demos]
+    if practice:
+        rates = [practise(out, library_of(model, demos, names, c), practice, jobs, progress) for c in (even, cuts)]
+        # Skills of a fixed length where they do better.
+        cuts = [e if a > b else c for a, b, c, e in zip(*rates, cuts, even, strict=True)]
+    library = library_of(model, demos, names, cuts)
+    if practice:
+        best = [max(x) for x in zip(*rates, strict=True)]
+        library["practice"] = [
+            {"task": str(d.attrs["task"]), "source": n, "trials": practice, "success": k}
+            for d, n, k in zip(demos, names, best, strict=True)
+        ]
+    write_library(out, library)
 
     error = verify(out)
     if not error <= TOLERANCE:

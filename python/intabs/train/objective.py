@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from intabs.evaluate.metrics import Scaling
 from intabs.model import kinematics
 from intabs.model.space import State
+
+FLIPPED = 0.03  # of the rollouts begin with the gripper the other way round
 
 
 def action_error(predicted: Tensor, target: Tensor, mask: Tensor) -> Tensor:
@@ -43,6 +46,19 @@ def held_error(logit: Tensor, change: Tensor, carried: Tensor, mask: Tensor) -> 
     weight = mask[..., None] * (square > 0.05)
     loss = torch.nn.functional.binary_cross_entropy_with_logits(logit, target, reduction="none")
     return (loss * weight).sum() / weight.sum().clamp(min=1)
+
+
+def pushed(s: State, rad: float, rest_ticks: int, rng) -> tuple[Tensor, Tensor]:
+    """Beside the demonstration: pushes (B, joints) [rad] of standard deviation `rad` of half of the Lite 6's first
+    states, and where its gripper stands the other way (B,), -1 for some of these, else 1. None where an object stirs
+    within rest_ticks: what is held would be held otherwise."""
+    n = min(rest_ticks + 1, s.p.shape[1])
+    stirs = ((s.p[:, :n] - s.p[:, :1]).norm(dim=-1) * s.known[:, :1]).amax((1, 2)) > 5e-3
+    chance, push = rng.random(len(s.p)), rng.normal(size=(len(s.p), s.agent.shape[-1] - 1))
+    push = rad * push * (chance < 0.5)[:, None]
+    flip = np.where(chance < FLIPPED, -1.0, 1.0)
+    push, flip = (torch.from_numpy(x.astype("f4")).to(s.p) for x in (push, flip))
+    return push * ~stirs[:, None], torch.where(stirs, 1.0, flip)
 
 
 class RolloutError(torch.nn.Module):

@@ -7,6 +7,7 @@ import json
 import math
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from intabs.errors import UserError
 from intabs.evaluate.metrics import Scaling, motion_of
 from intabs.model.networks import InteractionAbstractions, encoder_inputs, phase, phase_basis
 from intabs.model.space import Space, state_of
+from intabs.replay.replay import RETURN
 from intabs.train.boundaries import Boundaries
 from intabs.train.linear import start_linear
 from intabs.train.objective import (
@@ -28,6 +30,7 @@ from intabs.train.objective import (
     held_error,
     kl_between,
     kl_to_standard_normal,
+    pushed,
     termination_error,
 )
 from intabs.train.windows import Demonstration, Windows, WindowSampler, disturbed
@@ -35,6 +38,7 @@ from intabs.train.windows import Demonstration, Windows, WindowSampler, disturbe
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 CHECKPOINT_EVERY = 500
 VALIDATE_EVERY = 250
+PUSH_TICKS = 20  # by then a push has faded to a twelfth
 CHOICE = 0.02  # of eta's loss for the next skill [nat] beside that for the end of the running one [nat a tick]
 
 
@@ -119,6 +123,7 @@ class Trainer:
         self.replays = Path(replays) if replays else None
         torch.manual_seed(seed)
         torch.use_deterministic_algorithms(True, warn_only=device != "cpu")
+        torch.utils.deterministic.fill_uninitialized_memory = False  # a seventh of the time, and we read none
         train_demos, train_names = load_named(data, "train")
         valid_demos, _ = load_named(data, "valid")
         replayed = load_named(self.replays)[0] if self.replays else []
@@ -135,8 +140,10 @@ class Trainer:
         cuts = {d.source: self.boundaries.cuts(d.state) for d in recorded}  # a replay has those of its recording
         train = recorded + prepare(replayed, space, [str(d.attrs["source"]) for d in replayed])
         window, segment = o["window"], tuple(o["segment"])
-        self.sampler = WindowSampler(train, space, window, segment, augment)
-        self.joint_sampler = WindowSampler(train, space, window, segment, augment, [cuts[d.source] for d in train])
+        shown = {"strangers": o["strangers"], "siblings": o["siblings"]}
+        self.sampler = WindowSampler(train, space, window, segment, augment, **shown)
+        every = [cuts[d.source] for d in train]
+        self.joint_sampler = WindowSampler(train, space, window, segment, augment, every, **shown)
         valid = prepare(valid_demos, space)
         self.valid = WindowSampler(valid, space, window, segment) if valid else None
         self.model = InteractionAbstractions(config["model"], space)
@@ -180,14 +187,28 @@ class Trainer:
             carried = space.carried(now, tip, after.agent[..., : space.joints])
             terms.update(self._on_recorded_states(batch, state, z, *change, carried))
 
-        # pi on its own predictions.
-        rolled, _ = model.rollout(now[:, 0], z[batch.skill], batch.age, batch.ticks, hard=rng is None)
-        groups = self.rollout_error(rolled, after, batch.mask)
+        # pi on its own predictions, which on the Lite 6 may begin beside the demonstration and are to come back to it.
+        start, want = now[:, 0], after
+        if space.arm is not None and rng is not None:
+            push, flip = pushed(batch.state, o["push"], PUSH_TICKS, rng)
+            fades = (1 - RETURN) ** torch.arange(now.agent.shape[1] + 1, device=push.device)[:, None]
+            push = torch.nn.functional.pad(push[:, None] * fades, (0, 1))  # (B, N + 1, A)
+            agent = torch.cat([start.agent[:, :-1], start.agent[:, -1:] * flip[:, None]], 1)
+            start = replace(start, agent=agent + push[:, 0])
+            want = replace(after, agent=after.agent + push[:, 1:])
+        rolled, commands = model.rollout(start, z[batch.skill], batch.age, batch.ticks, hard=rng is None)
+        groups = self.rollout_error(rolled, want, batch.mask)
         terms.update(zip(("joints", "position", "orientation"), groups, strict=True))
+        if space.arm is not None:
+            at = torch.cat([start.agent[:, None], rolled.agent[:, :-1]], 1).detach()
+            back = RETURN * (now.agent - at)[..., :-1] / space.command_scale[:-1]
+            recalled = batch.command + torch.nn.functional.pad(back, (0, 1))
+            terms["recall"] = action_error(commands, recalled, batch.mask)
         if joint:
             terms.update(self._eta_terms(batch, state, z, mean, log_std))
         loss = (
             terms.get("agent", 0.0)
+            + o["recall"] * terms.get("recall", 0.0)
             + o["motion"] * sum(terms.get(k, 0.0) for k in ("environment", "response", "held"))
             + sum(w * g for w, g in zip(o["rollout"], groups, strict=True))
             + o["beta"] * (terms["kl"] + terms.get("kl_eta", 0.0))

@@ -51,14 +51,18 @@ class Windows:
 
 
 class WindowSampler:
-    """Every tick of every demonstration is equally likely to begin a window.
+    """A demonstration is drawn by the root of its length: a task that takes three times as long as another is
+    neither three times as important nor as quickly learned. Each of its ticks is equally likely to begin a window.
 
     ticks: N; segment: shortest and longest skill drawn; cuts: instead of drawing, for each demonstration the ticks at
     which skills begin and, last, T - 1. augment: {"turn": rad} of the whole scene about the base (the Lite 6) or
     {"mix", "scale", "shift", "turn"} of motions in W (any other agent): see `augmented`.
 
-    Where there are replays of a recording, half of the windows show the encoders the same ticks of another one: a skill
-    is to be what they have in common, and pi to find from the state how it goes here.
+    strangers: how often a slot that a demonstration of the Lite 6 does not use holds a resting object of another
+    one: in compositions there is more to see than in any demonstration.
+
+    siblings: how often the encoders see the same ticks of another replay of the recording, where there is one: a
+    skill is to be what they have in common, and pi to find from the state how it goes here.
     """
 
     def __init__(
@@ -69,15 +73,22 @@ class WindowSampler:
         segment: tuple[int, int],
         augment: dict | None = None,
         cuts: list[np.ndarray] | None = None,
+        strangers: float = 0.0,
+        siblings: float = 0.0,
     ):
         for i, d in enumerate(demonstrations):
             if len(d.state.agent) < 3:
                 raise UserError(f"demonstration {i} has {len(d.state.agent)} frames: 3 are the least")
         self.demonstrations, self.space, self.cuts = demonstrations, space, cuts
+        self.siblings = siblings
+        self.strangers = strangers if space.arm is not None else 0.0
         self.ticks, self.segment, self.augment = ticks, segment, augment or {}
         self.count = np.array([len(d.state.agent) - 1 for d in demonstrations])
         self.first = np.concatenate([[0], np.cumsum(self.count + 1)])
         self.state = State.join([d.state for d in demonstrations])
+        # For each slot the ticks that know it: strangers come from there.
+        self.seen = [torch.nonzero(self.state.known[:, i])[:, 0].numpy() for i in range(space.slots)]
+        self.used = np.array([(d.state.known > 0).any(0).numpy() for d in demonstrations])
         with_command = demonstrations[0].command is not None
         names = np.array([d.source for d in demonstrations])
         self.same = [np.flatnonzero(names == n) if n else np.array([i]) for i, n in enumerate(names)]
@@ -89,9 +100,8 @@ class WindowSampler:
     def _pick(self, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Demonstrations and first ticks. A window may run over the end, but holds a short skill at least."""
         room = np.maximum(self.count - self.segment[0] + 1, 1)
-        at = rng.integers(room.sum(), size=n)
-        demo = np.searchsorted(np.cumsum(room), at, side="right")
-        start = at - (np.cumsum(room) - room)[demo]
+        demo = rng.choice(len(room), size=n, p=np.sqrt(room) / np.sqrt(room).sum())
+        start = rng.integers(room[demo])
         if self.cuts is not None:  # from the beginning of a skill
             for i, d in enumerate(demo):
                 begins = self.cuts[d][:-1]
@@ -137,7 +147,7 @@ class WindowSampler:
         offset = np.arange(length.max())[None]
         shown = demo.copy()
         for i, d in enumerate(demo):
-            if len(self.same[d]) > 1 and rng.random() < 0.5:
+            if len(self.same[d]) > 1 and rng.random() < self.siblings:
                 shown[i] = rng.choice(self.same[d])
         shown_index = torch.from_numpy(self.first[shown][:, None] + np.minimum(t, last))
         state, seen = self.state[index], self.state[shown_index]
@@ -145,6 +155,9 @@ class WindowSampler:
             other = self.state[torch.from_numpy(self._others(demo, t, rng))] if "mix" in self.augment else None
             both = augmented(State.join([state, seen], cat=1), other, self.augment, self.space, rng)
             state, seen = both[:, : steps + 1], both[:, steps + 1 :]
+        if self.strangers:
+            self._show_strangers(state, self.used[demo], rng)
+            self._show_strangers(seen, self.used[shown], rng)
         return Windows(
             state,
             self.command[index[:, :-1]] if self.command is not None else None,
@@ -158,6 +171,14 @@ class WindowSampler:
             torch.from_numpy((offset < length[:, None]).astype("f4")),
             torch.from_numpy(np.append(begin[1:] // steps == begin[:-1] // steps, False).astype("f4")),
         )
+
+    def _show_strangers(self, s: State, used: np.ndarray, rng: np.random.Generator) -> None:
+        """In place. s (B, N, ...), used (B, S)."""
+        show = ~used & (rng.random(used.shape) < self.strangers) & np.array([len(x) > 0 for x in self.seen])
+        for b, slot in np.argwhere(show):
+            at = int(rng.choice(self.seen[slot]))
+            s.p[b, :, slot], s.R[b, :, slot] = self.state.p[at, slot], self.state.R[at, slot]
+            s.known[b, :, slot] = s.valid[b, :, slot] = 1
 
     def _others(self, demo: np.ndarray, t: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Windows to mix in, from anywhere."""

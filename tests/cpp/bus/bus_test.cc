@@ -39,6 +39,7 @@ void ForEachChannel(F f) {
   f(kPerceptionStatus);
   f(kSkillPlan);
   f(kSkillStatus);
+  f(kSkillControl);
   f(kLoopStatus);
   f(kPlantTruth);
   f(kPlantControl);

@@ -244,12 +244,26 @@ inline SkillStatus Largest() {
   m.b_probability = 0.5F;
   m.infer_us = 123.0F;
   m.end_reason = 2;
+  m.skill_end = 1;
+  m.retries = 3;
   return m;
 }
 inline bool Same(const SkillStatus& a, const SkillStatus& b) {
   return a.utime == b.utime && a.seq == b.seq && a.plan_id == b.plan_id && a.skill_index == b.skill_index &&
          a.n_skills == b.n_skills && a.progress == b.progress && a.b_probability == b.b_probability &&
-         a.infer_us == b.infer_us && a.end_reason == b.end_reason;
+         a.infer_us == b.infer_us && a.end_reason == b.end_reason && a.skill_end == b.skill_end && a.retries == b.retries;
+}
+
+template <>
+inline SkillControl Largest() {
+  Counter c;
+  auto m = Head<SkillControl>(c);
+  m.plan_id = c.Int();
+  m.action = SkillControl::kAbort;
+  return m;
+}
+inline bool Same(const SkillControl& a, const SkillControl& b) {
+  return a.utime == b.utime && a.seq == b.seq && a.plan_id == b.plan_id && a.action == b.action;
 }
 
 template <>

@@ -39,7 +39,7 @@ TEST_CASE("The policy sees state, skill and phase as in training") {
   normalizer.Apply(s);
   for (const float phase : {0.f, .1f, .25f, .6f, 1.f}) {
     Action action;
-    REQUIRE(policy.Step(observation, z, phase, action) == Status::kOk);
+    REQUIRE(policy.Step(observation, s, z, phase, action) == Status::kOk);
     const Eigen::VectorXf x = Input(s, z, phase);
     REQUIRE(pi.Step(x.data()) == Status::kOk);
     const auto agent = pi.Head(pi.HeadIndex("agent"));

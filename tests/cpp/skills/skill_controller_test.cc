@@ -12,8 +12,9 @@ namespace {
 
 constexpr int64_t kSession = 77;
 
-SkillController MakeController() {
-  return SkillController(Policy::FromWeights(RandomPolicyWeights(), ArmModel::Lite6()), kSession);
+SkillController MakeController(float eta_logit = 0) {
+  const WeightsFile weights = RandomPolicyWeights(kPolicyInputDim, kStateLayout, kPolicyPeriodUs, eta_logit);
+  return SkillController(SkillPlayer(Policy::FromWeights(weights, ArmModel::Lite6()), Termination(weights)), kSession);
 }
 
 std::vector<Skill> Plan(std::initializer_list<int> ticks) {
@@ -56,9 +57,10 @@ TEST_CASE("A plan plays each skill for its ticks, integrates steps, and then ask
   REQUIRE(controller.Start(5, Plan({3, 2})) == Status::kOk);
   JointVector last = r.status.q_commanded;
   for (int i = 0; i < 5; ++i) {
-    CHECK(controller.player().status().skill_index == (i < 3 ? 0 : 1));
     r.Advance();
     REQUIRE(controller.Tick(r.status, r.poses, command) == Status::kOk);
+    CHECK(controller.player().status().skill_index == (i < 3 ? 0 : 1));
+    CHECK(controller.player().status().skill_end == (i < 3 ? SkillEnd::kNone : SkillEnd::kLongest));
     CHECK(command.mode == ArmMode::kServo);
     CHECK(command.session == kSession);
     CHECK(command.status_seq == r.status.seq);
@@ -67,10 +69,111 @@ TEST_CASE("A plan plays each skill for its ticks, integrates steps, and then ask
     CHECK((command.q_target - last).cwiseAbs().maxCoeff() < 0.1);
     last = command.q_target;
   }
-  CHECK(controller.player().status().end_reason == EndReason::kFinished);
   r.Advance();
   CHECK(controller.Tick(r.status, r.poses, command) == Status::kFinished);
+  CHECK(controller.player().status().end_reason == EndReason::kFinished);
   CHECK(command.mode == ArmMode::kHold);
+}
+
+TEST_CASE("eta ends a skill between its bounds") {
+  for (const float logit : {10.f, -10.f}) {
+    SkillController controller = MakeController(logit);
+    Readings r;
+    ArmCommand command;
+    std::vector<Skill> plan = Plan({9, 9});
+    for (Skill& s : plan) s.min_ticks = 4;
+    REQUIRE(controller.Start(1, plan) == Status::kOk);
+    int first = 0;
+    while (controller.player().status().skill_index == 0) {
+      r.Advance();
+      REQUIRE(controller.Tick(r.status, r.poses, command) == Status::kOk);
+      first += controller.player().status().skill_index == 0;
+    }
+    CHECK(first == (logit > 0 ? 4 : 9));
+    CHECK(controller.player().status().skill_end == (logit > 0 ? SkillEnd::kTerminated : SkillEnd::kLongest));
+    CHECK((controller.player().status().b > 0.5f) == false);  // at its first tick a skill cannot end
+    r.Advance();
+    REQUIRE(controller.Tick(r.status, r.poses, command) == Status::kOk);
+    CHECK((controller.player().status().b > 0.5f) == (logit > 0));
+  }
+}
+
+// Skills of 2 ticks: three that approach (the object 30, 10 and 5 cm away as they begin), one that closes the gripper, one
+// that lifts it by 6 cm.
+std::vector<Skill> PlanWithEffect(const Readings& r) {
+  std::vector<Skill> plan = Plan({2, 2, 2, 2, 2});
+  const Eigen::Vector3f p_GO = (ArmModel::Lite6().Tip(r.status.q).Inverse() * r.poses.objects[0].X_WO).p.cast<float>();
+  const float distance[] = {.3f, .1f, .05f, 0.f, 0.f};
+  for (size_t k = 0; k < plan.size(); ++k) plan[k].record.p_GO[0] = p_GO + (.05f - distance[k]) * Eigen::Vector3f::UnitZ();
+  plan[4].record.gripper_closed = true;
+  for (size_t k = 0; k < plan.size(); ++k) plan[k].record.rested[0] = k < 4;
+  plan[4].record.moved[0] = 0.06f;
+  return plan;
+}
+
+TEST_CASE("A skill whose object stays where it was is tried again from where the object lies as it did, and not for ever") {
+  SkillController controller = MakeController();
+  Readings r;
+  ArmCommand command;
+  REQUIRE(controller.Start(1, PlanWithEffect(r)) == Status::kOk);
+  std::vector<int> played;
+  while (controller.player().playing()) {
+    r.Advance();
+    if (controller.Tick(r.status, r.poses, command) == Status::kOk) played.push_back(controller.player().status().skill_index);
+    REQUIRE(played.size() < 100);
+  }
+  std::vector<int> expected = {0, 0, 1, 1, 2, 2, 3, 3, 4, 4};
+  for (int retry = 0; retry < kMaxRetries; ++retry) expected.insert(expected.end(), {2, 2, 3, 3, 4, 4});
+  CHECK(played == expected);
+  CHECK(controller.player().status().retries == kMaxRetries);
+  CHECK(controller.player().status().end_reason == EndReason::kNoEffect);
+  CHECK(command.mode == ArmMode::kHold);
+}
+
+TEST_CASE("An effect that happens, even late, and one that cannot be seen are no reason to try again") {
+  const bool seen = GENERATE(true, false);
+  SkillController controller = MakeController();
+  Readings r;
+  ArmCommand command;
+  REQUIRE(controller.Start(1, PlanWithEffect(r)) == Status::kOk);
+  for (int tick = 0; tick < 11; ++tick) {
+    r.Advance();
+    if (!seen) r.poses.objects[0].valid = tick < 9;
+    if (seen && tick == 9) r.poses.objects[0].X_WO.p.z() += 0.03;
+    (void)controller.Tick(r.status, r.poses, command);
+  }
+  CHECK(controller.player().status().retries == 0);
+  CHECK(controller.player().status().end_reason == EndReason::kFinished);
+}
+
+TEST_CASE("A pause holds the arm and keeps the plan; a new plan goes on from the target of the old one") {
+  SkillController controller = MakeController();
+  Readings r;
+  ArmCommand command;
+  REQUIRE(controller.Start(1, Plan({5})) == Status::kOk);
+  r.Advance();
+  REQUIRE(controller.Tick(r.status, r.poses, command) == Status::kOk);
+  controller.Pause(true);
+  r.Advance();
+  CHECK(controller.Tick(r.status, r.poses, command) == Status::kNotReady);
+  CHECK(command.mode == ArmMode::kHold);
+  controller.Pause(false);
+  for (int i = 0; i < 3; ++i) {
+    r.Advance();
+    REQUIRE(controller.Tick(r.status, r.poses, command) == Status::kOk);
+  }
+  const JointVector target = command.q_target;
+  REQUIRE((target - r.status.q_commanded).norm() > 0);  // the filter is behind
+  REQUIRE(controller.Start(2, Plan({5})) == Status::kOk);
+  r.Advance();
+  REQUIRE(controller.Tick(r.status, r.poses, command) == Status::kOk);
+  SkillController fresh = MakeController();
+  Readings beside;
+  ArmCommand step;
+  REQUIRE(fresh.Start(2, Plan({5})) == Status::kOk);
+  beside.Advance();
+  REQUIRE(fresh.Tick(beside.status, beside.poses, step) == Status::kOk);
+  CHECK((command.q_target - target - (step.q_target - beside.status.q_commanded)).norm() < 1e-9);
 }
 
 TEST_CASE("Each skill starts from a fresh hidden state, so the same skill twice does the same from the same state") {
@@ -141,6 +244,8 @@ TEST_CASE("While poses are old the plan waits and the arm is asked to hold; with
     CHECK(command.mode == ArmMode::kServo);
     CHECK(command.q_target == expected.q_target);
   }
+  r.Advance();
+  CHECK(controller.Tick(r.status, r.poses, command) == Status::kFinished);
   CHECK(controller.player().status().end_reason == EndReason::kFinished);
 }
 

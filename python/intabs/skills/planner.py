@@ -1,0 +1,257 @@
+"""Plans from the skill library: whole demonstrations, compositions, and what leads to wanted object poses.
+
+A chain is the skills of one demonstration. What it does to the objects is told by its recording, carried over to
+where the objects lie now; the best candidates are then played in the head, by pi itself
+(cpp/intabs/skills/kinematic_rollout.h).
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from intabs import _core
+from intabs.errors import UserError
+from intabs.skills.library import SLOTS, TURN_LENGTH, Frame, Library, Skill, rotation
+
+AS_GOOD = 0.15  # success in practice that is as good as another
+MOVES = 0.04  # m (a turn counts TURN_LENGTH a radian): an object that comes so far is moved by a chain
+CANDIDATES = 64  # verified, at most
+UNPRACTISED = 0.05  # m: what a chain that never did its task in practice counts as farther from the goal
+BROUGHT_WITHIN = 0.12  # m: an object that ends so near another one was brought to it
+DONE = 0.03  # m (a turn counts TURN_LENGTH a radian): a wanted pose is reached
+
+
+@dataclass(frozen=True)
+class Goal:
+    """A pose an object is to come to; those of a plan in this order."""
+
+    slot: int
+    pose: np.ndarray  # (7,) p_WO, q_WO
+    position: bool = True  # what counts of it
+    turn: bool = True
+
+    def missing(self, pose: np.ndarray) -> np.ndarray:
+        """How far poses (..., 7) are from it [m]."""
+        out = np.zeros(pose.shape[:-1])
+        if self.position:
+            out = out + np.linalg.norm(pose[..., :3] - self.pose[:3], axis=-1)
+        if self.turn:
+            angle = (rotation(self.pose).inv() * rotation(pose.reshape(-1, 7))).magnitude()
+            out = out + TURN_LENGTH * angle.reshape(out.shape)
+        return out
+
+
+@dataclass
+class Plan:
+    skills: list[Skill]
+    about: str
+    predicted: np.ndarray | None = None  # (4, 7) object poses at its end, by pi in its head
+    missing: float = float("nan")  # m, of the goals in that prediction
+    search_s: float = 0.0
+    verify_s: float = 0.0
+
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, list[int]]:
+        """As _core.Rollout.run takes it: z (n, 16), shortest and longest duration (n, 2), index in the library."""
+        ticks = np.array([[s.min_ticks, s.max_ticks] for s in self.skills])
+        return np.stack([s.z for s in self.skills]), ticks, [s.index for s in self.skills]
+
+    def as_messages(self) -> list[dict]:
+        return [s.as_plan() for s in self.skills]
+
+
+def seen_from(observation: dict) -> Frame:
+    """Of _core.Session.observe or _core.Rollout.reset."""
+    return Frame(
+        np.asarray(observation["q"]),
+        bool(observation["gripper_closed"]),
+        np.asarray(observation["object_pose"]),
+        np.asarray(observation["object_valid"]),
+    )
+
+
+def whole(library: Library, task: str, seen: Frame | None, source: str = "") -> Plan:
+    """Of the demonstrations that do their task in practice the one whose objects lay as they lie now, most nearly;
+    tasks joined by + one after the other. source: only this one."""
+    skills: list[Skill] = []
+    sources = []
+    for one in task.split("+"):
+        chains = library.of_task(one)
+        best = max(library.rate(c) for c in chains)
+        chains = [c for c in chains if (c[0].source == source if source else library.rate(c) >= best - AS_GOOD)]
+        chain = chains[0] if seen is None else min(chains, key=lambda c: _apart(c, seen))
+        skills += chain
+        sources.append(f"{one}: {chain[0].source}")
+    return Plan(skills, ", ".join(sources))
+
+
+def _apart(chain: list[Skill], seen: Frame) -> float:
+    """How differently the objects of a chain lay as it began [m]."""
+    first = chain[0].frames[0]
+    both = np.flatnonzero(first.known & seen.known)
+    if len(both) < first.known.sum():
+        return float("inf") if not len(both) else 1e3 + len(both)
+    a, b = first.object_pose[both], seen.object_pose[both]
+    turn = (rotation(a).inv() * rotation(b)).magnitude()
+    return float((np.linalg.norm(a[:, :3] - b[:, :3], axis=1) + TURN_LENGTH * turn).sum())
+
+
+# --- what chains do ---------------------------------------------------------------------------------------------------
+def _turns(path: np.ndarray) -> np.ndarray:
+    """Angles from the first of poses (F, 7) [rad]."""
+    return (rotation(path[0]).inv() * rotation(path)).magnitude()
+
+
+class Effect:
+    """What a chain's recording did, object by object, so that it can be carried over to another scene."""
+
+    def __init__(self, chain: list[Skill]):
+        self.chain = chain
+        frames = [chain[0].frames[0], *(f for s in chain for f in s.frames[1:])]
+        self.first, last = frames[0], frames[-1]
+        self.path = np.stack([f.object_pose for f in frames])  # (F, 4, 7)
+        far = np.linalg.norm(self.path[..., :3] - self.path[0, :, :3], axis=-1).max(0)
+        turn = np.array([_turns(self.path[:, i]).max() for i in range(SLOTS)])
+        self.moved = [i for i in range(SLOTS) if self.first.known[i] and far[i] + TURN_LENGTH * turn[i] > MOVES]
+        # Where a moved object ended near one that rested, its path is told from there.
+        self.brought_to = {}
+        for i in self.moved:
+            resting = [j for j in range(SLOTS) if self.first.known[j] and j not in self.moved]
+            distance = {j: np.linalg.norm(last.object_pose[i, :3] - last.object_pose[j, :3]) for j in resting}
+            if distance and min(distance.values()) < BROUGHT_WITHIN and far[i] > MOVES:
+                self.brought_to[i] = min(distance, key=distance.get)
+
+    def on(self, pose: np.ndarray) -> np.ndarray:
+        """The objects' paths if they lie at pose (4, 7) now, (F, 4, 7)."""
+        out = np.repeat(pose[None], len(self.path), 0)
+        for i in self.moved:
+            at = self.brought_to.get(i, i)
+            old, new = self.path[0, at], pose[at]
+            R = rotation(new) * rotation(old).inv()
+            if at != i:  # brought to something: upright things stay upright
+                R = Rotation.from_rotvec([0, 0, R.as_rotvec()[2]])
+            out[:, i, :3] = new[:3] + R.apply(self.path[:, i, :3] - old[:3])
+            out[:, i, 3:] = np.roll((R * rotation(self.path[:, i])).as_quat(), 1, -1)
+        if self.brought_to:
+            out[0] = pose
+        return out
+
+
+def missing(goals: list[Goal], path: np.ndarray) -> tuple[float, int]:
+    """How far a path of the objects (F, 4, 7) stays from the goals, which are to be reached in their order, and the
+    last of each object at the end: the mean distance [m], and how many of them are reached."""
+    at, total, reached = 0, 0.0, 0
+    last = {g.slot: k for k, g in enumerate(goals)}
+    for k, g in enumerate(goals):
+        d = g.missing(path[at:, g.slot])
+        best = len(d) - 1 if last[g.slot] == k else int(np.argmin(d))
+        total += float(d[best])
+        reached += d[best] < DONE
+        at = at if last[g.slot] == k else at + best
+    return total / max(len(goals), 1), reached
+
+
+def goals_of(library: Library, task: str, seen: Frame) -> list[Goal]:
+    """What a task leaves behind, from the demonstration of it that began most like now: for each object it moves the
+    pose farthest from its start, if it does not stay there, and the last one."""
+    pose, out = seen.object_pose.copy(), []
+    for one in task.split("+"):
+        effect = Effect(min(library.of_task(one), key=lambda c: _apart(c, replace(seen, object_pose=pose))))
+        path = effect.on(pose)
+        for i in effect.moved:
+            far = TURN_LENGTH * _turns(path[:, i])
+            k = int(np.argmax(far))
+            if far[k] - far[-1] > 0.05:  # turned and turned back: poured
+                out.append(Goal(i, path[k, i]))
+            out.append(Goal(i, path[-1, i]))
+        pose = path[-1]
+    return out
+
+
+def load_goals(path: Path) -> list[Goal]:
+    """{"goals": [{"object": slot, "p_WO": [x, y, z], "q_WO": [w, x, y, z]}, ...]}; one of the two may be left out."""
+    try:
+        out = []
+        for g in json.loads(path.read_text())["goals"]:
+            if not 0 <= int(g["object"]) < SLOTS or not ("p_WO" in g or "q_WO" in g):
+                raise ValueError(f"a goal needs an object from 0 to {SLOTS - 1} and p_WO or q_WO")
+            q = np.array(g.get("q_WO", [1, 0, 0, 0]), float)
+            pose = np.concatenate([np.array(g.get("p_WO", [0, 0, 0]), float), q / (np.linalg.norm(q) or np.nan)])
+            if pose.shape != (7,) or not np.isfinite(pose).all():
+                raise ValueError("p_WO takes 3 numbers, q_WO 4, not all 0")
+            out.append(Goal(int(g["object"]), pose, "p_WO" in g, "q_WO" in g))
+    except FileNotFoundError:
+        raise UserError(f"--goal {path}: neither a task of the library nor a file") from None
+    except (ValueError, KeyError, TypeError, OSError) as e:
+        raise UserError(f"{path}: not goals ({type(e).__name__}: {e})") from None
+    if not out:
+        raise UserError(f"{path}: holds no goals")
+    return out
+
+
+class Planner:
+    """Finds plans for goals. Allocates the rollouts once."""
+
+    def __init__(self, weights: Path):
+        self.library = Library.load(weights)
+        self.effects = [Effect(chain) for chain in self.library.chains.values()]
+        self.head = _core.KinematicRollout(str(weights), CANDIDATES)
+
+    def search(self, goals: list[Goal], seen: Frame) -> list[list[Effect]]:
+        """The most promising sequences of chains, by their recordings; no longer than there are objects to be moved."""
+        unknown = [g.slot for g in goals if not seen.known[g.slot]]
+        if unknown:
+            raise UserError(f"the goal names object {unknown[0]}, which is not seen")
+        wanted = {g.slot for g in goals}
+        # Chains that move something nobody asked for are left out, unless nothing else is there.
+        able = [e for e in self.effects if seen.known[e.moved].all() and e.moved and set(e.moved) & wanted]
+        tidy = [e for e in able if set(e.moved) <= wanted]
+        found = self._ranked(goals, seen, tidy or able)
+        if not found:
+            raise UserError("no demonstration moves what the goal names")
+        return found[:CANDIDATES]
+
+    def _ranked(self, goals: list[Goal], seen: Frame, effects: list[Effect]) -> list[list[Effect]]:
+        ranked = []
+        first = {id(e): e.on(seen.object_pose) for e in effects}
+        for e in effects:
+            ranked.append((missing(goals, first[id(e)])[0], _apart(e.chain, seen), [e]))
+        if len({g.slot for g in goals}) > 1:
+            for a, b in product(effects, effects):
+                if set(a.moved) == set(b.moved):
+                    continue
+                path = first[id(a)]
+                more = b.on(path[-1])
+                apart = _apart(a.chain, seen) + _apart(b.chain, replace(seen, object_pose=path[-1]))
+                ranked.append((missing(goals, np.concatenate([path, more]))[0], apart, [a, b]))
+        # Recordings that do as well as each other: rather the one that began as things are now.
+        worth = {id(e): self.library.rate(e.chain) for e in effects}
+        ranked.sort(key=lambda x: x[0] + 0.1 * min(x[1], 10.0) + UNPRACTISED * sum(1 - worth[id(e)] for e in x[2]))
+        return [x[2] for x in ranked]
+
+    def find(self, goals: list[Goal], seen: Frame) -> Plan:
+        began = time.perf_counter()
+        candidates = self.search(goals, seen)
+        searched = time.perf_counter()
+        plans = [[s for e in sequence for s in e.chain] for sequence in candidates]
+        got = self.head.run(
+            seen.q, seen.gripper_closed, seen.object_pose, seen.known,
+            [np.stack([s.z for s in p]) for p in plans], [[s.ticks for s in p] for p in plans],
+        )  # fmt: skip
+        left = [missing(goals, path)[0] for path in got["object_pose"]]
+        rates = [np.prod([self.library.rate(e.chain) for e in sequence]) for sequence in candidates]
+        best = int(np.argmin([x + UNPRACTISED * (1 - r) for x, r in zip(left, rates, strict=True)]))
+        return Plan(
+            plans[best],
+            ", ".join(f"{e.chain[0].task}: {e.chain[0].source}" for e in candidates[best]),
+            got["object_pose"][best, -1],
+            left[best],
+            searched - began,
+            time.perf_counter() - searched,
+        )
