@@ -6,8 +6,10 @@
 
 #include <array>
 #include <cmath>
+#include <filesystem>
 #include <stdexcept>
 #include <string>
+#include <system_error>
 
 #include "intabs/core/pose.h"
 #include "intabs/core/text.h"
@@ -18,6 +20,8 @@ namespace intabs {
 // `named`: by another file's `calibration`; such a file names no third one (it might be itself).
 inline Pose LoadHandEye(const std::string& file, bool named = false) {
   const auto fail = [](const std::string& what) { throw std::runtime_error(OneLine(what)); };
+  // yaml-cpp leaks its buffer when it is given a folder.
+  if (std::error_code none; std::filesystem::is_directory(file, none)) fail(file + ": is a folder");
   YAML::Node root;
   try {
     root = YAML::LoadFile(file);
