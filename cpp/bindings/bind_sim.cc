@@ -78,11 +78,13 @@ class Rollout {
       py::gil_scoped_release release;
       session_.Reset(seed, spread_cm);
     }
+    reset_ = true;
     return Observe(session_);
   }
 
   py::dict Run(const Array<float>& z, const Array<int>& ticks, const std::vector<int>& library_index, int settle_ticks,
                const std::string& ablate, bool nudge, int film_every) {
+    if (!reset_) throw std::runtime_error("reset() comes before run(): each run begins in a scene of its own");
     const auto count = static_cast<py::ssize_t>(library_index.size());
     if (z.ndim() != 2 || z.shape(1) != kLatentDim || z.shape(0) != count || ticks.ndim() != 2 || ticks.shape(0) != count ||
         ticks.shape(1) != 2)
@@ -194,6 +196,7 @@ class Rollout {
   }
 
   Session session_;
+  bool reset_ = false;  // there is a scene
   SkillPlayer player_;
   std::vector<Skill> library_;
   std::unique_ptr<Renderer> renderer_;

@@ -47,7 +47,7 @@ class Options:
     spread: float = 2.0  # cm
     out: Path = Path("out/demo")
     viewer: bool = False
-    plan: Callable[[Planner, Frame], Plan] | None = None  # None: the demonstration that began most like what is seen
+    plan: Callable[[Planner, Frame], Plan] | None = None  # None: Planner.for_task
     weights: str = WEIGHTS
 
 
@@ -154,8 +154,7 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
     """One run. Returns its figures (as in summary.json) and, if the task failed, why. Raises UserError if something
     broke. `report(share, text)` is called while it runs."""
     weights = weights_folder(options.weights)
-    library = Library.load(weights)
-    whole(library, options.task, None)  # an unknown task is told before anything starts
+    whole(Library.load(weights), options.task, None)  # an unknown task is told before anything starts
     with as_user_error(RuntimeError, ValueError):
         subgoals = _core.World(str(paths.MODELS), options.task).subgoal_names
     worlds = ("fake_lite6", "lite6") if options.arm == "lite6" else ("plant",)
@@ -227,7 +226,8 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
         if options.perception == "tags":
             wait_for(run.sees, 20, "intabs_perception sent no fresh poses")
         seen = run.first_frame(_first_status(url, processes), options.perception == "truth")
-        plan = options.plan(Planner(weights), seen) if options.plan else whole(library, options.task, seen)
+        planner = Planner(weights)
+        plan = options.plan(planner, seen) if options.plan else planner.for_task(options.task, seen)
         report(0.0, plan.about)
         parts = messages.plan_parts(run.plan_id, plan.as_messages())
         longest_s = sum(s.max_ticks for s in plan.skills) * TICK_S

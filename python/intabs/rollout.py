@@ -34,9 +34,7 @@ class Setting:
     seed: int
     ablate: str
     format: str = ""  # of the weights, as the network runs them; empty: the manifest's
-    plan: str = (
-        "whole"  # the demonstration that began most like now, or "goal": found for the poses the task leaves behind
-    )
+    plan: str = ""  # as Planner.for_task; "whole": the demonstration that began most like now; "goal": found
     nudge: bool = False  # the first grasp is made to fail
     source: str = ""  # plays this demonstration's skills
     film: str = ""  # folder for a strip of pictures of each failure
@@ -83,8 +81,10 @@ def _run_trial(setting: Setting, trial: int) -> dict:
     seen = seen_from(world.reset(seed, setting.spread))
     if setting.plan == "goal":
         plan = planner.find(goals_of(planner.library, setting.task, seen), seen)
-    else:
+    elif setting.plan == "whole" or setting.source:
         plan = whole(planner.library, setting.task, seen, setting.source)
+    else:
+        plan = planner.for_task(setting.task, seen)
     z, ticks, index = plan.arrays()
     if setting.ablate == "z":
         z = z[np.random.default_rng(seed).permutation(len(z))]
@@ -98,7 +98,7 @@ def _run_trial(setting: Setting, trial: int) -> dict:
         write_strip(Path(setting.film) / f"failed_{trial:04d}.png", pictures)
     if not result["success"] and result["end_reason"] in END_REASONS:
         result["reason"] = END_REASONS[result["end_reason"]]
-    timing = {} if setting.plan == "whole" else {"search_s": plan.search_s, "verify_s": plan.verify_s}
+    timing = {"search_s": plan.search_s, "verify_s": plan.verify_s} if plan.predicted is not None else {}
     return {"trial": trial, "seed": seed, "plan": plan.about, **timing, **result}
 
 
@@ -113,7 +113,7 @@ def rollout(
     ablate: str = "",
     report: Path | None = None,
     resume: bool = False,
-    plan: str = "whole",
+    plan: str = "",
     nudge: bool = False,
     progress: Callable[[int, str], None] = lambda done, text: None,
 ) -> dict:
@@ -170,9 +170,8 @@ def rollout(
         "ablate": ablate,
         "retried": sum(r["retries"] > 0 for r in done),
     }
-    if plan == "goal":
-        times = {k: [r[k] for r in done] for k in ("search_s", "verify_s")}
-        figures |= {k: {"p50": float(np.median(v)), "max": max(v)} for k, v in times.items() if v}
+    times = {k: [r[k] for r in done if k in r] for k in ("search_s", "verify_s")}
+    figures |= {k: {"p50": float(np.median(v)), "max": max(v)} for k, v in times.items() if v}
     if report is not None:
         write_json(report / "figures.json", figures)
         plot_displacement(report / "displacement.png", task, done)

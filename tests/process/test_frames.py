@@ -237,8 +237,11 @@ def test_lockstep_with_bad_frames_gives_no_crash_and_no_wrong_pose_that_is_calle
     for camera in range(2):
         assert said.dropped[camera] == done["dropped", camera]
         assert said.torn[camera] >= done["torn while written", camera] + grain * 0.8 * done["torn", camera]
-        assert said.late[camera] >= 0.9 * done["late", camera] - 2  # others: the newest once more; few, so 2
+        # A late one may be the newest once more, and counts as doubled then.
+        assert said.late[camera] >= 0.7 * done["late", camera] - 2
         assert said.doubled[camera] >= done["doubled with its own stamps", camera]
+        both = done["late", camera] + done["doubled with its own stamps", camera]
+        assert said.late[camera] + said.doubled[camera] >= both
         total = sum(getattr(said, k)[camera] for k in ("frames", "dropped", "late", "doubled", "torn"))
         assert total == r["answered"]
 

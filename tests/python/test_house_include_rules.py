@@ -16,7 +16,7 @@ RULES = {
     "kinematics": ((), ("eigen", "urdf", "kdl")),
     "skills": (("nn", "kinematics/arm_model.h"), ("eigen", "json")),
     "control": (("kinematics/arm_model.h",), ("eigen",)),
-    "perception": ((), ("eigen", "opencv", "apriltag")),
+    "perception": ((), ("eigen", "opencv", "apriltag", "yaml")),
     "camera": ((), ("eigen", "opencv", "realsense", "posix")),
     "bus": ((), ("eigen", "lcm", "posix")),
     "plant": (("kinematics",), ("eigen", "mujoco", "egl", "glfw", "posix")),

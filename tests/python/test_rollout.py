@@ -3,12 +3,15 @@
 import os
 import signal
 
+import numpy as np
 import pytest
 
-from intabs import paths
+from intabs import _core, paths
 from intabs.errors import UserError
 from intabs.jobs import in_processes
-from intabs.rollout import rollout, wilson
+from intabs.rollout import UNSEEN, rollout, wilson
+from intabs.skills.library import Library
+from intabs.skills.planner import seen_from, whole
 
 WEIGHTS = paths.MODELS / "weights" / "lite6"
 if not (WEIGHTS / "manifest.json").exists():
@@ -35,6 +38,17 @@ def test_a_cut_report_is_taken_up_again_as_often_as_wanted(tmp_path):
 def test_without_actions_the_task_fails_with_its_reason():
     figures = rollout("pick_place", 1, ablate="policy")
     assert figures["success"] == 0 and sum(figures["failures"].values()) == 1
+
+
+def test_an_object_knocked_away_as_the_fingers_close_is_grasped_again():
+    world = _core.Rollout(str(paths.MODELS), "pick_place", str(WEIGHTS))
+    library = Library.load(WEIGHTS)
+    for nudge in (False, True):
+        plan = whole(library, "pick_place", seen_from(world.reset(UNSEEN, 1.0)))
+        got = world.run(*plan.arrays(), nudge=nudge)
+        jump = np.linalg.norm(np.diff(got["object_pose"][:, 0, :2], axis=0), axis=1).max()
+        assert got["success"], got["reason"]
+        assert (jump > 0.03) == nudge and (got["retries"] > 0) == nudge
 
 
 @pytest.mark.parametrize(

@@ -2,17 +2,13 @@
 // intabs_perception that names one.
 #pragma once
 
-#include <yaml-cpp/yaml.h>
-
 #include <array>
 #include <cmath>
-#include <filesystem>
 #include <stdexcept>
 #include <string>
-#include <system_error>
 
 #include "intabs/core/pose.h"
-#include "intabs/core/text.h"
+#include "intabs/perception/yaml.h"
 
 namespace intabs {
 
@@ -20,16 +16,7 @@ namespace intabs {
 // `named`: by another file's `calibration`; such a file names no third one (it might be itself).
 inline Pose LoadHandEye(const std::string& file, bool named = false) {
   const auto fail = [](const std::string& what) { throw std::runtime_error(OneLine(what)); };
-  // yaml-cpp leaks its buffer when it is given a folder.
-  if (std::error_code none; std::filesystem::is_directory(file, none)) fail(file + ": is a folder");
-  YAML::Node root;
-  try {
-    root = YAML::LoadFile(file);
-  } catch (const YAML::BadFile&) {
-    fail(file + ": cannot be read");
-  } catch (const YAML::Exception& e) {
-    fail(file + ": not readable as YAML: line " + std::to_string(e.mark.line + 1) + ": " + e.msg);
-  }
+  const YAML::Node root = LoadYaml(file);
   if (!root.IsMap()) fail(file + ": expected a map of values");
   if (const YAML::Node other = root["calibration"]) {
     if (!other.IsScalar()) fail(file + ": calibration: expected a file name");

@@ -2,69 +2,78 @@
 
 #include <algorithm>
 #include <array>
-#include <cctype>
 #include <cerrno>
 #include <charconv>
 #include <cmath>
 #include <cstdio>
-#include <cstdlib>
 #include <cstring>
 #include <fstream>
-#include <opencv2/core.hpp>
+#include <limits>
 #include <set>
 #include <span>
 #include <sstream>
 #include <stdexcept>
 #include <vector>
 
-#include "intabs/core/text.h"
 #include "intabs/core/types.h"
+#include "intabs/perception/yaml.h"
 
 namespace intabs {
 namespace {
 
 [[noreturn]] void Fail(const std::string& what) { throw std::runtime_error(OneLine(what)); }
 
+// Whether a key has a value.
+bool Given(const YAML::Node& node) { return node && !node.IsNull(); }
+
 // Every map says which keys it has: a misspelt key is an error, not a silent default.
-void AllowOnly(const cv::FileNode& map, const std::string& where, const std::vector<const char*>& keys) {
-  if (!map.isMap()) Fail(where + ": expected a map of values");
-  for (const std::string& key : map.keys()) {
+void AllowOnly(const YAML::Node& map, const std::string& where, const std::vector<const char*>& keys) {
+  if (!map.IsMap()) Fail(where + ": expected a map of values");
+  std::set<std::string> seen;
+  for (const auto& entry : map) {
+    const std::string key = entry.first.IsScalar() ? entry.first.Scalar() : "?";
     if (std::none_of(keys.begin(), keys.end(), [&](const char* k) { return key == k; })) {
       Fail(where + ": unknown key \"" + key + "\"");
     }
+    if (!seen.insert(key).second) Fail(where + ": \"" + key + "\" is given twice");
   }
 }
 
-cv::FileNode Get(const cv::FileNode& map, const std::string& where, const char* key) {
-  const cv::FileNode node = map[key];
-  if (node.empty()) Fail(where + ": \"" + key + "\" is missing");
+YAML::Node Get(const YAML::Node& map, const std::string& where, const char* key) {
+  const YAML::Node node = map[key];
+  if (!Given(node)) Fail(where + ": \"" + key + "\" is missing");
   return node;
 }
 
-double Number(const cv::FileNode& node, const std::string& where) {
-  if (!node.isInt() && !node.isReal()) Fail(where + ": expected a number");
-  return static_cast<double>(node);
+bool Quoted(const YAML::Node& scalar) { return scalar.Tag() == "!"; }
+
+double Number(const YAML::Node& node, const std::string& where) {
+  const double nan = std::numeric_limits<double>::quiet_NaN();
+  const double v = node.IsScalar() && !Quoted(node) ? node.as<double>(nan) : nan;
+  if (!std::isfinite(v)) Fail(where + ": expected a number");
+  return v;
 }
 
-int Integer(const cv::FileNode& node, const std::string& where) {
-  if (!node.isInt()) Fail(where + ": expected a whole number");
-  return static_cast<int>(node);
+int Integer(const YAML::Node& node, const std::string& where) {
+  int v = 0;
+  if (!node.IsScalar() || Quoted(node) || !YAML::convert<int>::decode(node, v)) Fail(where + ": expected a whole number");
+  return v;
 }
 
-std::string Text(const cv::FileNode& node, const std::string& where) {
-  if (!node.isString()) Fail(where + ": expected a text");
-  return static_cast<std::string>(node);
+std::string Text(const YAML::Node& node, const std::string& where) {
+  if (!node.IsScalar()) Fail(where + ": expected a text");
+  return node.Scalar();
 }
 
 template <size_t N>
-std::array<double, N> Numbers(const cv::FileNode& node, const std::string& where) {
-  if (!node.isSeq() || node.size() != N) Fail(where + ": expected " + std::to_string(N) + " numbers");
+std::array<double, N> Numbers(const YAML::Node& node, const std::string& where) {
+  if (!node.IsSequence() || node.size() != N) Fail(where + ": expected " + std::to_string(N) + " numbers");
   std::array<double, N> out;
-  for (size_t i = 0; i < N; ++i) out[i] = Number(node[static_cast<int>(i)], where);
+  for (size_t i = 0; i < N; ++i) out[i] = Number(node[i], where);
   return out;
 }
 
-Pose ReadPose(const cv::FileNode& node, const std::string& where) {
+Pose ReadPose(const YAML::Node& node, const std::string& where) {
   AllowOnly(node, where, {"p", "q"});
   const auto p = Numbers<3>(Get(node, where, "p"), where + ".p");
   const auto q = Numbers<4>(Get(node, where, "q"), where + ".q");
@@ -82,30 +91,25 @@ std::string Shortest(double v) {
 }
 
 // Lists of what a sequence holds; a lone value is no list.
-cv::FileNode Sequence(const cv::FileNode& node, const std::string& where) {
-  if (!node.isSeq()) Fail(where + ": expected a list");
+YAML::Node Sequence(const YAML::Node& node, const std::string& where) {
+  if (!node.IsSequence()) Fail(where + ": expected a list");
   return node;
 }
 
-Notes ReadNotes(const cv::FileNode& node, const std::string& where) {
+Notes ReadNotes(const YAML::Node& node, const std::string& where) {
   Notes notes;
-  if (node.empty()) return notes;
-  if (!node.isMap()) Fail(where + ": expected a map of values");
-  for (const std::string& key : node.keys()) {
-    const cv::FileNode value = node[key];
-    const std::string at = where + "." + key;
-    if (value.isInt()) {
-      notes.emplace_back(key, std::to_string(Integer(value, at)));
-    } else {
-      notes.emplace_back(key, value.isReal() ? Shortest(Number(value, at)) : Text(value, at));
-    }
+  if (!Given(node)) return notes;
+  if (!node.IsMap()) Fail(where + ": expected a map of values");
+  for (const auto& entry : node) {
+    const std::string key = Text(entry.first, where);
+    notes.emplace_back(key, Text(entry.second, where + "." + key));
   }
   return notes;
 }
 
-std::vector<Calibration::Camera> ReadCameras(const cv::FileNode& list) {
+std::vector<Calibration::Camera> ReadCameras(const YAML::Node& list) {
   std::vector<Calibration::Camera> cameras;
-  for (const cv::FileNode& node : Sequence(list, "cameras")) {
+  for (const YAML::Node& node : Sequence(list, "cameras")) {
     const std::string at = "cameras[" + std::to_string(cameras.size()) + "]";
     AllowOnly(node, at,
               {"name", "width", "height", "fx", "fy", "cx", "cy", "distortion", "X_WC", "source",
@@ -119,59 +123,61 @@ std::vector<Calibration::Camera> ReadCameras(const cv::FileNode& list) {
     m.fy = Number(Get(node, at, "fy"), at + ".fy");
     m.cx = Number(Get(node, at, "cx"), at + ".cx");
     m.cy = Number(Get(node, at, "cy"), at + ".cy");
-    if (!node["distortion"].empty()) m.distortion = Numbers<5>(node["distortion"], at + ".distortion");
-    if (!node["X_WC"].empty()) m.X_WC = ReadPose(node["X_WC"], at + ".X_WC");
-    if (!node["source"].empty()) m.source = Text(node["source"], at + ".source");
+    if (Given(node["distortion"])) m.distortion = Numbers<5>(node["distortion"], at + ".distortion");
+    if (Given(node["X_WC"])) m.X_WC = ReadPose(node["X_WC"], at + ".X_WC");
+    if (Given(node["source"])) m.source = Text(node["source"], at + ".source");
     camera.intrinsics = ReadNotes(node["intrinsics"], at + ".intrinsics");
     camera.extrinsics = ReadNotes(node["extrinsics"], at + ".extrinsics");
   }
   return cameras;
 }
 
-Calibration ReadCalibration(const cv::FileNode& root) {
+Calibration ReadCalibration(const YAML::Node& root) {
   AllowOnly(root, "top level", {"cameras", "X_WB", "hand_eye"});
   Calibration calibration;
-  if (!root["cameras"].empty()) calibration.cameras = ReadCameras(root["cameras"]);
-  if (!root["X_WB"].empty()) calibration.X_WB = ReadPose(root["X_WB"], "X_WB");
+  if (Given(root["cameras"])) calibration.cameras = ReadCameras(root["cameras"]);
+  if (Given(root["X_WB"])) calibration.X_WB = ReadPose(root["X_WB"], "X_WB");
   calibration.hand_eye = ReadNotes(root["hand_eye"], "hand_eye");
   return calibration;
 }
 
 // `folder`: of the file, with a slash at its end.
-PerceptionConfig Read(const cv::FileNode& root, const std::string& folder) {
+PerceptionConfig Read(const YAML::Node& root, const std::string& folder) {
   PerceptionConfig config;
-  AllowOnly(root, "top level", {kConfigKeys.begin(), kConfigKeys.end()});
-  if (!root["corner_sigma_px"].empty())
+  std::vector<const char*> keys(kConfigKeys.begin(), kConfigKeys.end());
+  keys.insert(keys.end(), kProgramKeys.begin(), kProgramKeys.end());
+  AllowOnly(root, "top level", keys);
+  if (Given(root["corner_sigma_px"]))
     config.corner_sigma_px = Number(root["corner_sigma_px"], "corner_sigma_px");
 
   Calibration calibration;
-  if (const cv::FileNode file = root["calibration"]; !file.empty()) {
-    if (!root["cameras"].empty() || !root["X_WB"].empty())
+  if (const YAML::Node file = root["calibration"]; Given(file)) {
+    if (Given(root["cameras"]) || Given(root["X_WB"]))
       Fail("calibration: its file gives cameras and X_WB; take them out here");
     const std::string name = Text(file, "calibration");
     calibration = LoadCalibration(name.starts_with('/') ? name : folder + name);
   } else {
     calibration.cameras = ReadCameras(Get(root, "top level", "cameras"));
-    if (!root["X_WB"].empty()) calibration.X_WB = ReadPose(root["X_WB"], "X_WB");
+    if (Given(root["X_WB"])) calibration.X_WB = ReadPose(root["X_WB"], "X_WB");
   }
   for (const Calibration::Camera& c : calibration.cameras) config.cameras.push_back(c.model);
   config.X_WB = calibration.X_WB.value_or(Pose{});
 
-  if (const cv::FileNode node = root["ground"]; !node.empty()) {
+  if (const YAML::Node node = root["ground"]; Given(node)) {
     AllowOnly(node, "ground", {"id", "size", "X_WT"});
     config.ground = GroundTag{Integer(Get(node, "ground", "id"), "ground.id"),
                               Number(Get(node, "ground", "size"), "ground.size"),
                               ReadPose(Get(node, "ground", "X_WT"), "ground.X_WT")};
   }
 
-  for (const cv::FileNode& node : Sequence(Get(root, "top level", "objects"), "objects")) {
+  for (const YAML::Node& node : Sequence(Get(root, "top level", "objects"), "objects")) {
     const std::string at = "objects[" + std::to_string(config.objects.size()) + "]";
     AllowOnly(node, at, {"slot", "id", "name", "tags"});
     ObjectModel object;
     object.slot = Integer(Get(node, at, "slot"), at + ".slot");
     object.id = Integer(Get(node, at, "id"), at + ".id");
     object.name = Text(Get(node, at, "name"), at + ".name");
-    for (const cv::FileNode& tag : Sequence(Get(node, at, "tags"), at + ".tags")) {
+    for (const YAML::Node& tag : Sequence(Get(node, at, "tags"), at + ".tags")) {
       const std::string tag_at = at + ".tags[" + std::to_string(object.tags.size()) + "]";
       AllowOnly(tag, tag_at, {"id", "size", "X_OT"});
       object.tags.push_back({Integer(Get(tag, tag_at, "id"), tag_at + ".id"),
@@ -242,61 +248,13 @@ void Check(const PerceptionConfig& config) {
 
 namespace {
 
-constexpr char kHeading[] = "%YAML:1.0\n---\n";  // OpenCV insists on it
-
-// Whether a YAML document begins or ends in this line. OpenCV may look for ever for what follows.
-bool HoldsMark(const std::string& line) {
-  char quote = 0, last = 0;  // open; before here, but for blanks
-  for (size_t i = 0; i < line.size(); ++i) {
-    const char c = line[i];
-    if (quote != 0) {
-      if (c == quote) quote = 0;
-      if (c == '\\') ++i;
-      continue;
-    }
-    if (c == '#') return false;
-    const bool between = last == 0 || last == '}' || last == ']' || last == '"' || last == '\'';
-    if (between && (line.compare(i, 3, "...") == 0 || line.compare(i, 3, "---") == 0)) return true;
-    if (c == '"' || c == '\'') quote = c;
-    if (c != ' ' && c != '\t') last = c;
-  }
-  return false;
-}
-
 // read(root, folder of the file).
 template <class F>
 auto Load(const std::string& path, const F& read) {
-  std::ifstream file(path);
-  if (!file) Fail(path + ": cannot be read");
-  std::stringstream text;
-  text << kHeading;
-  bool begun = false;
-  for (std::string line; std::getline(file, line);) {
-    if (HoldsMark(line)) {
-      if (!begun && line.starts_with("---")) line.clear();
-      if (!line.empty()) Fail(path + ": not readable as YAML: one document a file, take out \"...\" and \"---\"");
-    }
-    if (const size_t at = line.find_first_not_of(" \t\r"); !begun && at != std::string::npos && line[at] != '#') {
-      // A list or map in brackets has an end too, and OpenCV the same trouble with what follows it.
-      if (!std::isalpha(static_cast<unsigned char>(line[at]))) Fail(path + ": top level: expected a map of values, KEY: VALUE");
-      begun = true;
-    }
-    const std::string key = line.substr(0, line.find(':'));
-    const bool option = std::find(kProgramKeys.begin(), kProgramKeys.end(), key) != kProgramKeys.end();
-    text << (option ? "" : line) << "\n";
-  }
+  const YAML::Node root = LoadYaml(path);
   try {
-    const cv::FileStorage storage(
-        text.str(), cv::FileStorage::READ | cv::FileStorage::MEMORY | cv::FileStorage::FORMAT_YAML);
-    return read(storage.root(), path.substr(0, path.rfind('/') + 1));
-  } catch (const cv::Exception& e) {
-    // OpenCV has "(LINE): what" in the place of the function's name; the line counts our heading.
-    const size_t at = e.func.find("): ");
-    const bool placed = e.func.starts_with('(') && at != std::string::npos;
-    Fail(path + ": not readable as YAML: " +
-         (placed ? "line " + std::to_string(std::atoi(e.func.c_str() + 1) - 2) + e.func.substr(at + 1)
-                 : e.err));
-  } catch (const std::exception& e) {  // of the reader too: texts it cannot make
+    return read(root, path.substr(0, path.rfind('/') + 1));
+  } catch (const std::exception& e) {
     Fail(path + ": " + e.what());
   }
 }
@@ -325,7 +283,7 @@ std::string Flow(const Pose& X) {
 }  // namespace
 
 PerceptionConfig LoadPerceptionConfig(const std::string& path) {
-  return Load(path, [](const cv::FileNode& root, const std::string& folder) {
+  return Load(path, [](const YAML::Node& root, const std::string& folder) {
     PerceptionConfig config = Read(root, folder);
     Check(config);
     return config;
@@ -333,7 +291,7 @@ PerceptionConfig LoadPerceptionConfig(const std::string& path) {
 }
 
 Calibration LoadCalibration(const std::string& path) {
-  return Load(path, [](const cv::FileNode& root, const std::string&) { return ReadCalibration(root); });
+  return Load(path, [](const YAML::Node& root, const std::string&) { return ReadCalibration(root); });
 }
 
 void SaveCalibration(const std::string& path, const Calibration& calibration) {

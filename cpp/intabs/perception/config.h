@@ -39,8 +39,7 @@ struct PerceptionConfig {
   double corner_sigma_px = 0.05;  // standard deviation of a tag corner's coordinate
 };
 
-// The keys of the file. Options of intabs_perception may stand in it too, each on a line; they are not looked
-// at here.
+// The keys of the file. Options of intabs_perception may stand in it too; they are not looked at here.
 inline constexpr std::array kConfigKeys = {"cameras", "ground",   "objects",    "corner_sigma_px",
                                            "X_WB",    "hand_eye", "calibration"};
 inline constexpr std::array kProgramKeys = {"lcm", "prefix", "ring", "json", "threads", "hands"};
@@ -50,8 +49,7 @@ inline constexpr std::array kProgramKeys = {"lcm", "prefix", "ring", "json", "th
 void Check(const PerceptionConfig& config);
 
 // Reads and checks a file like models/config/perception.yaml. Throws std::runtime_error "FILE: what is
-// wrong". Read by OpenCV's own YAML reader, so that processes, bindings and tests share one loader without
-// another library. `calibration: FILE` (seen from that file) takes cameras and X_WB from there.
+// wrong". `calibration: FILE` (seen from that file) takes cameras and X_WB from there.
 PerceptionConfig LoadPerceptionConfig(const std::string& path);
 
 // How something was found, for people: key and value (a number, or a text that needs no quotes).

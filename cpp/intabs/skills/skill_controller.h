@@ -21,7 +21,6 @@ class SkillController {
   void Abort(EndReason why) noexcept { player_.Abort(why); }
   // While paused the arm holds and the plan waits.
   void Pause(bool on) noexcept { paused_ = on; }
-  bool paused() const noexcept { return paused_; }
 
   // Real-time safe. Always fills a command that is safe to send: while nothing is played it asks the driver to hold.
   // Returns what the player said. While poses are older than kMaxPoseAgeUs the arm is asked to hold and the plan waits

@@ -24,7 +24,7 @@ Status SkillPlayer::Start(int64_t plan_id, std::span<const Skill> skills) noexce
   for (const Skill& s : skills) {
     if (s.min_ticks < 1 || s.max_ticks < s.min_ticks || s.max_ticks > kMaxSkillTicks || !s.z.allFinite()) return Status::kOutOfRange;
   }
-  at_rest_ = !playing();
+  at_rest_ = !playing() || (first_ && at_rest_);  // a plan that had no tick yet left no target
   std::copy(skills.begin(), skills.end(), skills_.begin());
   status_ = PlayerStatus{};
   status_.plan_id = plan_id;
@@ -126,6 +126,8 @@ Status SkillPlayer::Tick(const Observation& observation, const JointVector& q_co
       gripper_closed_ = observation.gripper_closed;
     }
     first_ = false;
+    before_ = observation.objects;  // also for a plan that begins amid a motion
+    moved_.fill(0);
     Begin(0, SkillEnd::kNone, observation);
   }
   Watch(observation);

@@ -26,14 +26,9 @@ def register(app: typer.Typer) -> None:
 
         Which demonstrations, and in which order, is what the policy in its head gets done best (`intabs plan`)."""
         from intabs import play
-        from intabs.skills.planner import goals_of
 
         if len(tasks) < 2:
             raise UserError("compose needs two tasks or more; for one use `intabs demo --task`")
         world = "+".join(tasks)
-
-        def find(planner, seen):
-            return planner.find(goals_of(planner.library, world, seen), seen)
-
-        options = play.Options(world, perception.value, clock.value, "plant", seed, out=out, viewer=viewer, plan=find)
+        options = play.Options(world, perception.value, clock.value, "plant", seed, out=out, viewer=viewer)
         play_and_tell(options, "compose", json)

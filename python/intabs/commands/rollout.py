@@ -63,11 +63,11 @@ def register(app: typer.Typer) -> None:
         """Closed-loop success in the plant: in process, in lockstep, with a 95 % interval."""
         from intabs.rollout import rollout as run
 
-        way = plan or (Way.goal if "+" in task else Way.whole)
         with Progress("rollout", total=trials) as progress:
             figures = run(
                 task, trials, spread, weights, perception.value, seed, jobs,
-                "" if ablate is Ablation.none else ablate.value, report, resume, way.value, nudge, progress.update,
+                "" if ablate is Ablation.none else ablate.value, report, resume,
+                plan.value if plan else "", nudge, progress.update,
             )  # fmt: skip
         write_json(json, figures)
         low, high = figures["ci95"]

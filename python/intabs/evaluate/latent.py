@@ -118,24 +118,9 @@ def _agent_line(agent: np.ndarray) -> np.ndarray:
     """Places of the Lite 6's joints and tip (8, 3); of a hand its keypoints; of another agent nothing."""
     if len(agent) == 7:
         from intabs import _core
+        from intabs.skills.library import arm_line
 
-        frames = np.asarray(_core.ArmModel.lite6().frames)
-        X, line = np.eye(4), [np.zeros(3)]
-        for i, f in enumerate(frames):
-            L = np.eye(4)
-            w, x, y, z = f[3:]
-            L[:3, :3] = [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-            ]
-            L[:3, 3] = f[:3]
-            X = X @ L
-            line.append(X[:3, 3].copy())
-            if i < 6:
-                c, s = np.cos(agent[i]), np.sin(agent[i])
-                X = X @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-        return np.array(line)
+        return arm_line(_core.ArmModel.lite6(), agent[:6])
     if len(agent) % 3 == 0 and len(agent) >= 63:
         return agent[:63].reshape(21, 3)
     return np.zeros((0, 3))

@@ -235,6 +235,11 @@ class Planner:
         ranked.sort(key=lambda x: x[0] + 0.1 * min(x[1], 10.0) + UNPRACTISED * sum(1 - worth[id(e)] for e in x[2]))
         return [x[2] for x in ranked]
 
+    def for_task(self, task: str, seen: Frame) -> Plan:
+        """The demonstration of it that began most like now; for tasks joined by +, which nobody demonstrated as a
+        whole, what is found for the poses they leave behind, in the order that pi gets done best."""
+        return self.find(goals_of(self.library, task, seen), seen) if "+" in task else whole(self.library, task, seen)
+
     def find(self, goals: list[Goal], seen: Frame) -> Plan:
         began = time.perf_counter()
         candidates = self.search(goals, seen)

@@ -115,7 +115,7 @@ TEST_CASE("A calibration that does not hold is refused in one line that names fi
   refused("", "calibration: c.yaml\nX_WB: {p: [0, 0, 0], q: [1, 0, 0, 0]}\n", "take them out");
   refused(camera + ", distortion: [-3, 0, 0, 0, 0], X_WC: {p: [0, 0, 1], q: [1, 0, 0, 0]}}\n",
           "calibration: c.yaml\n", "camera a: the distortion cannot be undone");
-  refused("cameras: [\n", "calibration: c.yaml\n", "c.yaml: not readable as YAML: line 1");
+  refused("cameras: [\n", "calibration: c.yaml\n", "c.yaml: not readable as YAML: line 2");
 }
 
 }  // namespace intabs

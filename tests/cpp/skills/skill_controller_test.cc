@@ -176,6 +176,38 @@ TEST_CASE("A pause holds the arm and keeps the plan; a new plan goes on from the
   CHECK((command.q_target - target - (step.q_target - beside.status.q_commanded)).norm() < 1e-9);
 }
 
+TEST_CASE("A plan replaced before its first tick begins where the arm stands") {
+  SkillController controller = MakeController();
+  Readings r;
+  ArmCommand command;
+  REQUIRE(controller.Start(1, Plan({5})) == Status::kOk);
+  REQUIRE(controller.Start(2, Plan({5})) == Status::kOk);
+  r.Advance();
+  REQUIRE(controller.Tick(r.status, r.poses, command) == Status::kOk);
+  CHECK((command.q_target - r.status.q_commanded).cwiseAbs().maxCoeff() < 0.1);
+}
+
+TEST_CASE("A plan that begins amid a recorded motion judges by what it saw itself") {
+  SkillController controller = MakeController();
+  Readings r;
+  ArmCommand command;
+  std::vector<Skill> plan = Plan({2});
+  REQUIRE(controller.Start(1, plan) == Status::kOk);  // the object moves by 20 cm under this one
+  for (int tick = 0; tick < 3; ++tick) {
+    r.Advance();
+    r.poses.objects[0].X_WO.p.z() += 0.1;
+    (void)controller.Tick(r.status, r.poses, command);
+  }
+  plan[0].record.rested.fill(false);
+  plan[0].record.moved[0] = 0.1f;
+  REQUIRE(controller.Start(2, plan) == Status::kOk);
+  while (controller.player().playing()) {
+    r.Advance();
+    (void)controller.Tick(r.status, r.poses, command);
+  }
+  CHECK(controller.player().status().end_reason == EndReason::kNoEffect);
+}
+
 TEST_CASE("Each skill starts from a fresh hidden state, so the same skill twice does the same from the same state") {
   SkillController controller = MakeController();
   Readings r;
