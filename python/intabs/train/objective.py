@@ -10,6 +10,7 @@ from intabs.evaluate.metrics import Scaling
 from intabs.model import kinematics
 from intabs.model.space import State
 
+REACH, UNIT = 0.08, 0.02  # m
 FLIPPED = 0.03  # of the rollouts begin with the gripper the other way round
 
 
@@ -59,6 +60,22 @@ def pushed(s: State, rad: float, rest_ticks: int, rng) -> tuple[Tensor, Tensor]:
     flip = np.where(chance < FLIPPED, -1.0, 1.0)
     push, flip = (torch.from_numpy(x.astype("f4")).to(s.p) for x in (push, flip))
     return push * ~stirs[:, None], torch.where(stirs, 1.0, flip)
+
+
+def near_error(got: State, want: State, arm: kinematics.Arm, mask: Tensor) -> Tensor:
+    """How far a rollout of the Lite 6 stays from the demonstration where it counts: known objects seen from the tip,
+    |dp| + ANGLE_WEIGHT * angle in units of 2 cm, weighed by 1 / (1 + (distance from the tip / REACH)^2). (B, N, ...)."""
+    p, R = (list(x) for x in zip(*(_seen_from_tip(s, arm) for s in (got, want)), strict=True))
+    apart = torch.sqrt(((p[0] - p[1]) ** 2).sum(-1) + 1e-8)
+    apart = apart + kinematics.ANGLE_WEIGHT * kinematics.angle_between(R[0], R[1])
+    weight = want.known / (1 + (p[1] ** 2).sum(-1) / REACH**2)
+    return ((apart / UNIT * weight).sum(-1) * mask).sum() / mask.sum()
+
+
+def _seen_from_tip(s: State, arm: kinematics.Arm) -> tuple[Tensor, Tensor]:
+    p_WG, R_WG = arm.tip(s.agent[..., :-1])
+    R_GW = R_WG.transpose(-1, -2)[..., None, :, :]
+    return (R_GW @ (s.p - p_WG[..., None, :])[..., None])[..., 0], R_GW @ s.R
 
 
 class RolloutError(torch.nn.Module):

@@ -30,6 +30,7 @@ from intabs.train.objective import (
     held_error,
     kl_between,
     kl_to_standard_normal,
+    near_error,
     pushed,
     termination_error,
 )
@@ -204,11 +205,13 @@ class Trainer:
             back = RETURN * (now.agent - at)[..., :-1] / space.command_scale[:-1]
             recalled = batch.command + torch.nn.functional.pad(back, (0, 1))
             terms["recall"] = action_error(commands, recalled, batch.mask)
+            terms["near"] = near_error(rolled, want, space.arm, batch.mask)
         if joint:
             terms.update(self._eta_terms(batch, state, z, mean, log_std))
         loss = (
             terms.get("agent", 0.0)
             + o["recall"] * terms.get("recall", 0.0)
+            + o["near"] * terms.get("near", 0.0)
             + o["motion"] * sum(terms.get(k, 0.0) for k in ("environment", "response", "held"))
             + sum(w * g for w, g in zip(o["rollout"], groups, strict=True))
             + o["beta"] * (terms["kl"] + terms.get("kl_eta", 0.0))
@@ -218,13 +221,15 @@ class Trainer:
 
     def _on_recorded_states(self, batch: Windows, state: torch.Tensor, z, response, change, carried) -> dict:
         """pi on the Lite 6's recorded states: its commands, which no kinematic rollout can tell, and all else."""
+        space = self.model.space
         seen, carried, change = batch.pieces(state), batch.pieces(carried), batch.pieces(change)
         age = torch.arange(seen.shape[1], device=seen.device, dtype=seen.dtype)[None]
         basis = phase_basis(phase(age, batch.within.sum(1, keepdim=True)))
         y = self.model.pi(self.model.policy_input(seen, z[:, None].expand(-1, seen.shape[1], -1), basis))
+        command, moved = self.model.moves(y, batch.pieces(batch.state[:, :-1].agent))
         return {
-            "agent": action_error(y["agent"], batch.pieces(batch.command), batch.within),
-            "response": action_error(y["response"], batch.pieces(response), batch.within),
+            "agent": action_error(command, batch.pieces(batch.command), batch.within),
+            "response": action_error(moved / space.response_scale, batch.pieces(response), batch.within),
             "environment": action_error(self.model.change(y, carried), change, batch.within),
             "held": held_error(y["carried"], change, carried, batch.within),
         }
