@@ -306,6 +306,42 @@ def test_resuming_gives_the_weights_of_an_unbroken_run(data, tmp_path):
     assert all(torch.equal(whole[k], resumed[k]) for k in whole)
 
 
+def test_two_processes_train_as_one_does(data, tmp_path):
+    """Odd batches and windows that end early: shares differ in all their counts."""
+    settings = [*SMALL, "train.batch=7", "objective.joint_from=0.3"]
+    alone = Trainer(load_config("intabs-small", settings), data, tmp_path / "alone", 0, "cpu")
+    result = alone.train()
+    command = ["train", "--config", "intabs-small", "--data", str(data), "--out", str(tmp_path / "both")]
+    command += [x for s in settings for x in ("--set", s)]
+    done = subprocess.run(
+        [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--rdzv-backend", "c10d",
+         "--rdzv-endpoint", "127.0.0.1:0", "--local-addr", "127.0.0.1", "-m", "intabs.cli", *command],
+        env={**os.environ, "OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo"}, capture_output=True, text=True,
+        timeout=240,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.count("held out") == 1  # one of them speaks
+    both = json.loads((tmp_path / "both" / "result.json").read_text())
+    assert abs(both["loss"] - result["loss"]) < 1e-4 * result["loss"]
+    for k, v in result["valid"].items():
+        assert abs(both["valid"][k] - v) < 1e-3 * abs(v) + 1e-5, k
+    model, _ = load_model(tmp_path / "both")
+    want = alone.model.state_dict()
+    for k, v in model.state_dict().items():
+        torch.testing.assert_close(v, want[k], rtol=1e-3, atol=1e-4)
+
+
+def test_training_ends_early_with_the_best(data, tmp_path, monkeypatch):
+    monkeypatch.setattr("intabs.train.trainer.VALIDATE_EVERY", 1)
+    losses = iter([3.0, 2.0, 2.5, 2.6, 1.0])
+    config = load_config("intabs-small", [*SMALL, "train.patience=2"])
+    trainer = Trainer(config, data, tmp_path / "run", 0, "cpu")
+    monkeypatch.setattr(trainer, "validate", lambda: {"loss": next(losses)})
+    result = trainer.train()
+    assert result["steps"] == 4 and result["best_step"] == 2
+    assert load_model(tmp_path / "run")[1]["step"] == 2
+
+
 def test_training_learns_on_held_out_demonstrations_what_is_held(data, tmp_path):
     trainer = Trainer(
         load_config("intabs-small", [*SMALL, "train.steps=120", "train.lr=4.0e-3"]), data, tmp_path / "run", 0, "cpu"
@@ -331,7 +367,7 @@ def test_a_bad_config_is_one_clear_line(config, overrides, says):
 
 
 def test_a_loss_that_is_not_finite_stops_the_training(data, tmp_path):
-    with pytest.raises(UserError, match="not finite at step"):
+    with pytest.raises(UserError, match=r"not finite at step \d+, batch of demo"):
         train(data, tmp_path / "run", extra=["train.lr=1.0e+12", "train.clip=1.0e+30"], steps=50)
 
 

@@ -34,7 +34,9 @@ def register(app: typer.Typer) -> None:
         seed: Annotated[int, typer.Option(help="Of initial weights, batches and noise.", min=0)] = 0,
         json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
     ) -> None:
-        """Train encoders, policy and high-level policy; held-out demonstrations are scored on the way."""
+        """Train encoders, policy and high-level policy; held-out demonstrations are scored on the way.
+
+        By several processes: torchrun --nproc-per-node 2 -m intabs.cli train ..."""
         try:
             import torch
         except ImportError:
@@ -48,6 +50,9 @@ def register(app: typer.Typer) -> None:
             trainer.resume()
         elif trainer.path.exists():
             raise UserError(f"{trainer.path} is there already: add --resume, or give another --out")
+        if trainer.rank > 0:
+            trainer.train()
+            return
         with Progress("train", total=trainer.config["train"]["steps"]) as progress:
             figures = trainer.train(progress.update)
         write_json(json, figures)

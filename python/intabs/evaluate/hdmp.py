@@ -7,13 +7,12 @@ well built, by the package movement-primitives (Ijspeert et al. 2013; Ude et al.
 
 from __future__ import annotations
 
-import importlib.util
-
 import numpy as np
 from scipy.signal import find_peaks
 from scipy.spatial.transform import Rotation
 
 from intabs.errors import UserError
+from intabs.evaluate import packages
 from intabs.evaluate.metrics import Motion, Sample
 
 KERNELS = 15
@@ -93,11 +92,11 @@ class Hdmp:
 
     @staticmethod
     def installed() -> bool:
-        return importlib.util.find_spec("movement_primitives") is not None
+        return packages.find("movement_primitives")
 
     def __init__(self):
         if not self.installed():
-            raise UserError("hdmp needs the package movement-primitives: pip install movement-primitives pytransform3d")
+            raise UserError(f"hdmp needs the package movement-primitives: {packages.CURE}")
 
     def reconstruct(self, of: Sample, cuts: list[int]) -> Motion:
         from movement_primitives.dmp import DMP, CartesianDMP

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, distributed
 
 from intabs.evaluate.metrics import Scaling
 from intabs.model import kinematics
@@ -14,14 +14,26 @@ REACH, UNIT = 0.08, 0.02  # m
 FLIPPED = 0.03  # of the rollouts begin with the gripper the other way round
 
 
+def mean_over(values: Tensor, mask: Tensor) -> Tensor:
+    """Of values (any shape) where mask is 1, or as heavy as it says. With several processes the sum is ours, the count
+    that of all, times their number: so the mean over processes is the mean over the whole batch."""
+    count = mask.sum()
+    if distributed.is_initialized():
+        count = count.detach().clone()
+        distributed.all_reduce(count)
+        count = count / distributed.get_world_size()
+    return (values * mask).sum() / count.clamp(min=1e-6)
+
+
 def action_error(predicted: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     """-log N(a; mu, sigma^2 I) up to scale and constant: mean over ticks and dimensions. (M, L, n), mask (M, L)."""
-    return (((predicted - target) ** 2).mean(-1) * mask).sum() / mask.sum()
+    return mean_over(((predicted - target) ** 2).mean(-1), mask)
 
 
 def kl_to_standard_normal(mean: Tensor, log_std: Tensor) -> Tensor:
     """KL(N(mean, std^2) || N(0, I)) summed over z, mean over skills [nat] (Kingma & Welling 2014, appendix B)."""
-    return (0.5 * (mean**2 + torch.exp(2 * log_std) - 1) - log_std).sum(-1).mean()
+    kl = (0.5 * (mean**2 + torch.exp(2 * log_std) - 1) - log_std).sum(-1)
+    return mean_over(kl, torch.ones_like(kl))
 
 
 def kl_between(mean: Tensor, log_std: Tensor, prior_mean: Tensor, prior_log_std: Tensor) -> Tensor:
@@ -33,8 +45,7 @@ def kl_between(mean: Tensor, log_std: Tensor, prior_mean: Tensor, prior_log_std:
 
 def termination_error(logit: Tensor, begins: Tensor, mask: Tensor) -> Tensor:
     """-log Bernoulli(b) of eta, (B, N): mean over ticks."""
-    loss = torch.nn.functional.binary_cross_entropy_with_logits(logit, begins, reduction="none")
-    return (loss * mask).sum() / mask.sum()
+    return mean_over(torch.nn.functional.binary_cross_entropy_with_logits(logit, begins, reduction="none"), mask)
 
 
 def held_error(logit: Tensor, change: Tensor, carried: Tensor, mask: Tensor) -> Tensor:
@@ -45,8 +56,7 @@ def held_error(logit: Tensor, change: Tensor, carried: Tensor, mask: Tensor) -> 
     square = (carried**2).sum(-1)
     target = ((change * carried).sum(-1) / square.clamp(min=1e-6)).clamp(0, 1)
     weight = mask[..., None] * (square > 0.05)
-    loss = torch.nn.functional.binary_cross_entropy_with_logits(logit, target, reduction="none")
-    return (loss * weight).sum() / weight.sum().clamp(min=1)
+    return mean_over(torch.nn.functional.binary_cross_entropy_with_logits(logit, target, reduction="none"), weight)
 
 
 def pushed(s: State, rad: float, rest_ticks: int, rng) -> tuple[Tensor, Tensor]:
@@ -63,13 +73,13 @@ def pushed(s: State, rad: float, rest_ticks: int, rng) -> tuple[Tensor, Tensor]:
 
 
 def near_error(got: State, want: State, arm: kinematics.Arm, mask: Tensor) -> Tensor:
-    """How far a rollout of the Lite 6 stays from the demonstration where it counts: known objects seen from the tip,
-    |dp| + ANGLE_WEIGHT * angle in units of 2 cm, weighed by 1 / (1 + (distance from the tip / REACH)^2). (B, N, ...)."""
+    """How far a rollout of the Lite 6 stays from the demonstration where it counts: known objects seen from the
+    tip, |dp| + ANGLE_WEIGHT * angle in units of 2 cm, weighed by 1 / (1 + (distance from the tip / REACH)^2). (B, N, ...)."""
     p, R = (list(x) for x in zip(*(_seen_from_tip(s, arm) for s in (got, want)), strict=True))
     apart = torch.sqrt(((p[0] - p[1]) ** 2).sum(-1) + 1e-8)
     apart = apart + kinematics.ANGLE_WEIGHT * kinematics.angle_between(R[0], R[1])
     weight = want.known / (1 + (p[1] ** 2).sum(-1) / REACH**2)
-    return ((apart / UNIT * weight).sum(-1) * mask).sum() / mask.sum()
+    return mean_over((apart / UNIT * weight).sum(-1), mask)
 
 
 def _seen_from_tip(s: State, arm: kinematics.Arm) -> tuple[Tensor, Tensor]:
@@ -101,4 +111,4 @@ class RolloutError(torch.nn.Module):
         angle = kinematics.angle_between(got.R, want.R) / torch.pi * want.valid
         groups = ((got.agent - want.agent) * self.agent, position, angle)
         norms = [torch.sqrt((e**2).sum(-1) + 1e-8) if e.shape[-1] else mask * 0 for e in groups]
-        return torch.stack([(n * mask).sum() / mask.sum() for n in norms])
+        return torch.stack([mean_over(n, mask) for n in norms])

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
+from torch import distributed
 
 from intabs import __version__, _core
 from intabs.data.demos import Demo
@@ -30,6 +31,7 @@ from intabs.train.objective import (
     held_error,
     kl_between,
     kl_to_standard_normal,
+    mean_over,
     near_error,
     pushed,
     termination_error,
@@ -74,9 +76,9 @@ def load_config(name_or_file: str, overrides: list[str]) -> dict:
         if type(new) is not type(node[last]):
             raise UserError(f"--set {item}: wants a value like {node[last]}")
         node[last] = new
-    for key in ("steps", "batch"):
-        if config["train"][key] < 1:
-            raise UserError(f"train.{key} is {config['train'][key]}: must be 1 or more")
+    for key, least in (("steps", 1), ("batch", 1), ("patience", 0)):
+        if config["train"][key] < least:
+            raise UserError(f"train.{key} is {config['train'][key]}: must be {least} or more")
     return config
 
 
@@ -114,12 +116,41 @@ def prepare(demos: list[Demo], space: Space, names: list[str] | None = None) -> 
     return out
 
 
+def join_others(device: str) -> tuple[int, int, str]:
+    """Rank, number of processes, device: as torchrun says in the environment."""
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    if world == 1:
+        return 0, 1, device
+    if not distributed.is_initialized():
+        distributed.init_process_group("nccl" if device == "cuda" else "gloo")
+    return distributed.get_rank(), world, f"cuda:{os.environ['LOCAL_RANK']}" if device == "cuda" else device
+
+
+class _Curves:
+    """TensorBoard."""
+
+    def __init__(self, run: Path, step: int):
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.writer = SummaryWriter(str(run), purge_step=step)
+
+    def add(self, group: str, values: dict, step: int) -> None:
+        for k, v in values.items():
+            self.writer.add_scalar(f"{group}/{k}", float(v), step)
+
+    def close(self) -> None:
+        self.writer.close()
+
+
 class Trainer:
-    """replays: a file of `intabs replay`; those of held-out demonstrations are left out."""
+    """Under torchrun several processes share each batch, and train as one does.
+
+    replays: a file of `intabs replay`; those of held-out demonstrations are left out."""
 
     def __init__(
         self, config: dict, data: Path | str, run: Path | str, seed: int, device: str, replays: Path | str | None = None
     ):
+        self.rank, self.world, device = join_others(device)
         self.config, self.data, self.run, self.seed, self.device = config, Path(data), Path(run), seed, device
         self.replays = Path(replays) if replays else None
         torch.manual_seed(seed)
@@ -158,6 +189,7 @@ class Trainer:
         self.rng = np.random.default_rng(seed)
         self.step = 0
         self.seconds = 0.0
+        self.best = (math.inf, 0)  # loss on what is held out, and the step
 
     def _rate(self, step: int) -> float:
         """Linear warm-up, then half a cosine to 5 %."""
@@ -179,19 +211,20 @@ class Trainer:
         mean, log_std = model.encode(*(batch.pieces(x) for x in inputs), batch.within)
         z = mean
         if rng is not None:
-            noise = rng.standard_normal(tuple(mean.shape), dtype="f4")
+            of_windows, of_skills = batch.chance(rng)
+            noise = of_skills.standard_normal(tuple(mean.shape))
             z = mean + torch.exp(log_std) * torch.from_numpy(noise).to(mean.device)
         terms = {"kl": kl_to_standard_normal(mean, log_std)}
         if space.arm is not None:
             if rng is not None:  # what a servo with errors and cameras with errors would say
-                state, _ = space.features(disturbed(now, self.config["noise"], rng))
+                state, _ = space.features(disturbed(now, self.config["noise"], of_windows))
             carried = space.carried(now, tip, after.agent[..., : space.joints])
             terms.update(self._on_recorded_states(batch, state, z, *change, carried))
 
         # pi on its own predictions, which on the Lite 6 may begin beside the demonstration and are to come back to it.
         start, want = now[:, 0], after
         if space.arm is not None and rng is not None:
-            push, flip = pushed(batch.state, o["push"], PUSH_TICKS, rng)
+            push, flip = pushed(batch.state, o["push"], PUSH_TICKS, of_windows)
             fades = (1 - RETURN) ** torch.arange(now.agent.shape[1] + 1, device=push.device)[:, None]
             push = torch.nn.functional.pad(push[:, None] * fades, (0, 1))  # (B, N + 1, A)
             agent = torch.cat([start.agent[:, :-1], start.agent[:, -1:] * flip[:, None]], 1)
@@ -252,8 +285,9 @@ class Trainer:
         chosen = {k: y[k][first, length[first]] for k in ("mean", "log_std")}
         prior = (chosen["mean"], chosen["log_std"].clamp(-4, 2))
         q = (mean[first + 1], log_std[first + 1])
-        terms["choice"] = kl_between(*(x.detach() for x in q), *prior).mean()  # trains eta
-        terms["kl_eta"] = kl_between(*q, *(x.detach() for x in prior)).mean()  # trains the encoders
+        one = torch.ones_like(first, dtype=mean.dtype)
+        terms["choice"] = mean_over(kl_between(*(x.detach() for x in q), *prior), one)  # trains eta
+        terms["kl_eta"] = mean_over(kl_between(*q, *(x.detach() for x in prior)), one)  # trains the encoders
         return terms
 
     def validate(self) -> dict:
@@ -265,8 +299,8 @@ class Trainer:
         sums: dict[str, float] = {}
         with torch.no_grad():
             for _ in range(4):
-                _, terms = self._loss(self.valid.sample(64, rng).to(self.device), None)
-                for k, v in terms.items():
+                loss, terms = self._loss(self.valid.sample(64, rng).to(self.device), None)
+                for k, v in {"loss": loss, **terms}.items():
                     sums[k] = sums.get(k, 0.0) + float(v) / 4
         self.model.train()
         return sums
@@ -277,55 +311,88 @@ class Trainer:
         t = self.config["train"]
         joint = self.step >= self.config["objective"]["joint_from"] * t["steps"] and self.step % 2 == 0
         sampler = self.joint_sampler if joint else self.sampler
-        loss, terms = self._loss(sampler.sample(t["batch"], self.rng).to(self.device), self.rng, joint)
-        if not torch.isfinite(loss):
-            raise UserError(f"loss is not finite at step {self.step}; lower train.lr or look at the data")
+        batch = sampler.sample(t["batch"], self.rng)
+        ours = batch.share(self.rank, self.world) if self.world > 1 else batch
+        loss, terms = self._loss(ours.to(self.device), self.rng, joint)
         self.optimizer.zero_grad()
         loss.backward()
+        if self.world > 1:
+            loss = self._average(loss, terms)
+        if not torch.isfinite(loss):
+            names = ", ".join(dict.fromkeys(batch.names))
+            raise UserError(
+                f"loss is not finite at step {self.step}, batch of {names}; lower train.lr or look at the data"
+            )
         torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config["train"]["clip"])
         self.optimizer.step()
         self.scheduler.step()
         self.step += 1
         return loss.detach(), terms
 
-    def train(self, progress=lambda step, text: None) -> dict:
-        from torch.utils.tensorboard import SummaryWriter
+    def _average(self, loss: torch.Tensor, terms: dict) -> torch.Tensor:
+        """Gradients, loss and terms over all processes, in place but for the loss, which is returned."""
+        grads = [p.grad for p in self.model.parameters() if p.grad is not None]
+        numbers = torch.stack([loss.detach(), *terms.values()])
+        flat = torch.cat([g.flatten() for g in grads] + [numbers])
+        distributed.all_reduce(flat)
+        *parts, numbers = (flat / self.world).split([g.numel() for g in grads] + [len(numbers)])
+        for g, part in zip(grads, parts, strict=True):
+            g.copy_(part.view_as(g))
+        terms.update(zip(terms, numbers[1:], strict=True))
+        return numbers[0]
 
-        writer = SummaryWriter(str(self.run), purge_step=self.step)
-        total = self.config["train"]["steps"]
+    def train(self, progress=lambda step, text: None) -> dict:
+        total, patience = self.config["train"]["steps"], self.config["train"]["patience"]
         if self.step >= total:
             raise UserError(f"{self.run} has {self.step} steps, train.steps is {total}: nothing to do")
+        log = _Curves(self.run, self.step) if self.rank == 0 else None
         valid: dict = {}
         loss_value = float("nan")
         began = time.monotonic() - self.seconds
-        while self.step < total:
+        over = False
+        while not over:
             loss, terms = self.one_step()
             self.seconds = time.monotonic() - began
-            if self.step % 50 == 0 or self.step == total:
+            over = self.step == total
+            if self.step % 50 == 0 or over:
                 loss_value = loss.item()
-                writer.add_scalar("train/loss", loss_value, self.step)
-                for k, v in terms.items():
-                    writer.add_scalar(f"train/{k}", float(v), self.step)
+                if log:
+                    log.add("train", {"loss": loss_value, **terms}, self.step)
                 progress(self.step, f"loss {loss_value:.4f}")
-            if self.step % VALIDATE_EVERY == 0 or self.step == total:
+            if self.step % VALIDATE_EVERY == 0 or over:
                 valid = self.validate()
-                for k, v in valid.items():
-                    writer.add_scalar(f"valid/{k}", v, self.step)
+                if log:
+                    log.add("valid", valid, self.step)
                 text = ", ".join(f"{k} {v:.4f}" for k, v in valid.items())
                 progress(self.step, f"loss {loss_value:.4f}; held out: {text}")
-            if self.step % CHECKPOINT_EVERY == 0 or self.step == total:
+                if patience and valid:
+                    over = self._no_better(valid["loss"], patience) or over
+            if self.step % CHECKPOINT_EVERY == 0 or over:
                 self.save()
-        writer.close()
         result = {"steps": self.step, "seconds": round(self.seconds, 1), "loss": loss_value, "valid": valid}
-        (self.run / "result.json").write_text(json.dumps(result, indent=1))
+        if log:
+            log.close()
+            if patience and valid:
+                result["best_step"] = self.best[1]
+                os.replace(self.run / "best.pt", self.path)
+            (self.run / "result.json").write_text(json.dumps(result, indent=1))
         return result
+
+    def _no_better(self, loss: float, patience: int) -> bool:
+        """Keeps the best so far; whether it has been so for too long."""
+        if loss < self.best[0]:
+            self.best = (loss, self.step)
+            self.save("best.pt")
+        return self.step - self.best[1] >= patience * VALIDATE_EVERY
 
     # --- checkpoints ---------------------------------------------------------------------------------------------
     @property
     def path(self) -> Path:
         return self.run / "checkpoint.pt"
 
-    def save(self) -> None:
+    def save(self, name: str = "checkpoint.pt") -> None:
+        if self.rank > 0:
+            return
         self.run.mkdir(parents=True, exist_ok=True)
         partial = self.path.with_suffix(".partial")
         torch.save(
@@ -342,6 +409,7 @@ class Trainer:
                 "seed": self.seed,
                 "step": self.step,
                 "seconds": self.seconds,
+                "best": self.best,
                 "model": self.model.state_dict(),
                 "optimizer": self.optimizer.state_dict(),
                 "scheduler": self.scheduler.state_dict(),
@@ -349,7 +417,7 @@ class Trainer:
             },
             partial,
         )
-        os.replace(partial, self.path)
+        os.replace(partial, self.run / name)
 
     def resume(self) -> None:
         if not self.path.exists():
@@ -365,7 +433,7 @@ class Trainer:
         self.optimizer.load_state_dict(c["optimizer"])
         self.scheduler.load_state_dict(c["scheduler"])
         self.rng.bit_generator.state = json.loads(c["rng"])
-        self.step, self.seconds = c["step"], c["seconds"]
+        self.step, self.seconds, self.best = c["step"], c["seconds"], c["best"]
 
 
 def load_checkpoint(run: Path | str) -> dict:

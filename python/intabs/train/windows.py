@@ -5,7 +5,7 @@ A window is N ticks of one demonstration. Its cuts are drawn anew each time (seg
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import torch
@@ -24,6 +24,31 @@ class Demonstration:
 
 
 @dataclass
+class Ours:
+    windows: int  # of all processes
+    rows: slice  # those of this one
+    skills: int
+    mine: np.ndarray | slice
+
+
+class Chance:
+    """Draws for the rows of all processes, of which some are ours: so several processes train as one does."""
+
+    def __init__(self, rng: np.random.Generator, total: int, rows):
+        self.rng, self.total, self.rows = rng, total, rows
+
+    def normal(self, size: tuple[int, ...]) -> np.ndarray:
+        return self.rng.normal(size=(self.total, *size[1:]))[self.rows]
+
+    def random(self, n: int) -> np.ndarray:
+        return self.rng.random(self.total)[self.rows]
+
+    def standard_normal(self, size: tuple[int, ...]) -> np.ndarray:
+        """float32"""
+        return self.rng.standard_normal((self.total, *size[1:]), dtype="f4")[self.rows]
+
+
+@dataclass
 class Windows:
     """B windows of N ticks, M skills of at most L ticks in them."""
 
@@ -38,6 +63,29 @@ class Windows:
     gather: Tensor  # (M, L) long, the skill's ticks among the B N
     within: Tensor  # (M, L) 1: a tick of the skill, 0: after its end
     whole: Tensor  # (M,) 1: its end lies in the window; 0: the window's last, which may go on
+    names: list[str] = field(default_factory=list)  # of the windows' demonstrations
+    ours: Ours | None = None  # where these stand in a batch that several processes share
+
+    def share(self, rank: int, world: int) -> Windows:
+        """Every world-th window: the share of one of several processes."""
+        steps = self.skill.shape[1]
+        rows, mine = slice(rank, None, world), self.gather[:, 0] // steps % world == rank
+        taken = ("state", "command", "shown", "shown_command", "mask", "age", "ticks")
+        parts = {k: getattr(self, k)[rows] if getattr(self, k) is not None else None for k in taken}
+        gather = self.gather[mine]
+        return Windows(
+            **parts,
+            skill=(mine.long().cumsum(0) - 1)[self.skill[rows]],
+            gather=gather // steps // world * steps + gather % steps,
+            within=self.within[mine],
+            whole=self.whole[mine],
+            ours=Ours(len(self.skill), rows, len(self.gather), mine.numpy()),
+        )
+
+    def chance(self, rng: np.random.Generator) -> tuple[Chance, Chance]:
+        """For draws a window, and draws a skill."""
+        o = self.ours or Ours(len(self.skill), slice(None), len(self.gather), slice(None))
+        return Chance(rng, o.windows, o.rows), Chance(rng, o.skills, o.mine)
 
     def pieces(self, x: Tensor) -> Tensor:
         """(B, N, d) -> (M, L, d), by skill."""
@@ -170,6 +218,7 @@ class WindowSampler:
             torch.from_numpy(begin[:, None] + np.minimum(offset, length[:, None] - 1)),
             torch.from_numpy((offset < length[:, None]).astype("f4")),
             torch.from_numpy(np.append(begin[1:] // steps == begin[:-1] // steps, False).astype("f4")),
+            [self.demonstrations[d].source or f"demonstration {d}" for d in demo],
         )
 
     def _show_strangers(self, s: State, used: np.ndarray, rng: np.random.Generator) -> None:
@@ -239,7 +288,7 @@ def augmented(s: State, other: State | None, how: dict, space: Space, rng: np.ra
     )
 
 
-def disturbed(s: State, noise: dict, rng: np.random.Generator) -> State:
+def disturbed(s: State, noise: dict, rng: np.random.Generator | Chance) -> State:
     """As a servo and cameras with errors would give it. Standard deviations: {"object_mm", "object_deg"} one error an
     object and window, {"tick_mm", "joint_mrad"} one a tick. s (B, N, ...) of the Lite 6."""
     n, t, slots, _ = s.p.shape
