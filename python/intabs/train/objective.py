@@ -74,7 +74,8 @@ def pushed(s: State, rad: float, rest_ticks: int, rng) -> tuple[Tensor, Tensor]:
 
 def near_error(got: State, want: State, arm: kinematics.Arm, mask: Tensor) -> Tensor:
     """How far a rollout of the Lite 6 stays from the demonstration where it counts: known objects seen from the
-    tip, |dp| + ANGLE_WEIGHT * angle in units of 2 cm, weighed by 1 / (1 + (distance from the tip / REACH)^2). (B, N, ...)."""
+    tip, |dp| + ANGLE_WEIGHT * angle in units of 2 cm, weighed by 1 / (1 + (distance from the tip / REACH)^2).
+    (B, N, ...)."""
     p, R = (list(x) for x in zip(*(_seen_from_tip(s, arm) for s in (got, want)), strict=True))
     apart = torch.sqrt(((p[0] - p[1]) ** 2).sum(-1) + 1e-8)
     apart = apart + kinematics.ANGLE_WEIGHT * kinematics.angle_between(R[0], R[1])
