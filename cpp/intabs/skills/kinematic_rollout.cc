@@ -38,14 +38,13 @@ Status KinematicRollout::Tick(std::span<const std::vector<Skill>> plans) {
   if (const Status status = batch_.Step(input_.data()); status != Status::kOk) return status;
   const auto agent = batch_.Head(codec_.agent_head), environment = batch_.Head(codec_.environment_head);
   const auto response = batch_.Head(codec_.response_head), carried = batch_.Head(codec_.carried_head);
-  const auto twist = batch_.Head(codec_.twist_head);
   for (size_t i = 0; i < plans.size(); ++i) {
     Place& at = places_[i];
     if (at.skill == plans[i].size()) continue;
     const auto row = static_cast<Eigen::Index>(i);
     Action action;
     const PolicyCodec::Heads heads{agent.row(row).data(), environment.row(row).data(), response.row(row).data(),
-                                   carried.row(row).data(), twist.row(row).data()};
+                                   carried.row(row).data()};
     if (const Status status = codec_.Decode(states_[i], heads, action); status != Status::kOk) return status;
     codec_.Advance(action, states_[i]);
     if (++at.tick == ExpectedTicks(plans[i][at.skill])) at = {at.skill + 1, 0};

@@ -31,26 +31,6 @@ constexpr float kSquash = 8.f;  // predicted changes saturate at so many of thei
 
 float Squash(float x) { return kSquash * std::tanh(x / kSquash); }
 
-constexpr double kAngleWeight = 0.1;  // [m/rad]
-constexpr double kDamping = 0.01;    // [m] of singular values that are .05 and more in the work space
-
-using Matrix6d = Eigen::Matrix<double, kNumJoints, kNumJoints>;
-
-// The joint displacements [rad] that move the tip as twists say: damped least squares (Nakamura & Hanafusa 1986), angles
-// weighed by kAngleWeight; two at once, for one Jacobian.
-Eigen::Matrix<double, kNumJoints, 2> JointSteps(const ArmModel& arm, const JointVector& q,
-                                                 const Eigen::Matrix<double, kTwistDim, 2>& twist_G) noexcept {
-  Pose X_WG;
-  ArmJacobian J = arm.TipAndJacobian(q, X_WG);
-  J.bottomRows<3>() *= kAngleWeight;
-  const Eigen::Matrix3d R_WG = X_WG.q.toRotationMatrix();
-  Eigen::Matrix<double, kTwistDim, 2> twist_W;
-  twist_W.topRows<3>() = R_WG * twist_G.topRows<3>();
-  twist_W.bottomRows<3>() = kAngleWeight * (R_WG * twist_G.bottomRows<3>());
-  const Matrix6d damped = J.transpose() * J + kDamping * kDamping * Matrix6d::Identity();
-  return damped.llt().solve(J.transpose() * twist_W);
-}
-
 }  // namespace
 
 PolicyCodec::PolicyCodec(const WeightsFile& weights, const ArmModel& arm, const Network& pi) : arm_(arm) {
@@ -73,7 +53,6 @@ PolicyCodec::PolicyCodec(const WeightsFile& weights, const ArmModel& arm, const 
   environment_head = head("environment", kEnvironmentActionDim);
   response_head = head("response", kNumJoints);
   carried_head = head("carried", kMaxObjects);
-  twist_head = head("twist", 2 * kTwistDim);
   normalizer_.mean = ReadVector<StateVector>(manifest, dir, "/normalizer/state_mean");
   const StateVector scale = ReadVector<StateVector>(manifest, dir, "/normalizer/state_scale");
   Demand((scale.array() > 0).all(), dir, "/normalizer/state_scale must be positive");
@@ -84,12 +63,9 @@ PolicyCodec::PolicyCodec(const WeightsFile& weights, const ArmModel& arm, const 
   Demand(normalizer_.limit > 0, dir, "/normalizer/limit must be positive");
   agent_scale_ = ReadVector<decltype(agent_scale_)>(manifest, dir, "/normalizer/agent_action_scale");
   response_scale_ = ReadVector<decltype(response_scale_)>(manifest, dir, "/normalizer/response_scale");
-  twist_scale_ = ReadVector<decltype(twist_scale_)>(manifest, dir, "/normalizer/twist_scale");
   environment_scale_ = ReadVector<decltype(environment_scale_)>(manifest, dir, "/normalizer/environment_action_scale");
   Demand((agent_scale_.array() > 0).all() && (environment_scale_.array() > 0).all() && (response_scale_.array() > 0).all(),
          dir, "/normalizer/agent_action_scale, environment_action_scale and response_scale must be positive");
-  Demand((twist_scale_.array() > 0).all() && (twist_scale_.array() < 1).all(), dir,
-         "/normalizer/twist_scale must be positive and below 1");
   // A step of a radian a tick is ten times what the arm can do: such weights are broken.
   Demand((agent_scale_.head<kNumJoints>().array() < 1).all(), dir,
          "/normalizer/agent_action_scale holds a joint step of 1 rad a tick or more");
@@ -113,14 +89,9 @@ void PolicyCodec::Encode(const StateVector& s, const LatentVector& z, float phas
 }
 
 Status PolicyCodec::Decode(const Observation& observation, const Heads& heads, Action& action) const noexcept {
-  Eigen::Matrix<double, kTwistDim, 2> twist;
-  for (int i = 0; i < kTwistDim; ++i) {
-    for (int k = 0; k < 2; ++k) twist(i, k) = Squash(heads.twist[kTwistDim * k + i]) * twist_scale_[i];
-  }
-  const Eigen::Matrix<double, kNumJoints, 2> steps = JointSteps(arm_, observation.q, twist);
   for (int i = 0; i < kNumJoints; ++i) {
-    action.dq_step[i] = heads.agent[i] * agent_scale_[i] + steps(i, 0);
-    action.response[i] = Squash(heads.response[i]) * response_scale_[i] + steps(i, 1);
+    action.dq_step[i] = heads.agent[i] * agent_scale_[i];
+    action.response[i] = Squash(heads.response[i]) * response_scale_[i];
   }
   action.gripper_closed = heads.agent[kNumJoints] > 0.f;
   const Pose X_WG = arm_.Tip(observation.q);
@@ -173,8 +144,7 @@ Status Policy::Step(const Observation& observation, const StateVector& s, const 
   infer_us_ = std::chrono::duration<float, std::micro>(std::chrono::steady_clock::now() - before).count();
   return codec_.Decode(observation,
                        {pi_.Head(codec_.agent_head).data(), pi_.Head(codec_.environment_head).data(),
-                        pi_.Head(codec_.response_head).data(), pi_.Head(codec_.carried_head).data(),
-                        pi_.Head(codec_.twist_head).data()},
+                        pi_.Head(codec_.response_head).data(), pi_.Head(codec_.carried_head).data()},
                        action);
 }
 

@@ -26,9 +26,6 @@ inline constexpr int kPhaseBasis = 5;
 // What pi takes: [s, b(phase), z, z b_0(phase), ..., z b_4(phase)], b of a skill's phase in [0, 1].
 inline constexpr int kPolicyInputDim = kStateDim + kPhaseBasis + kLatentDim * (1 + kPhaseBasis);
 
-// A motion of the tip in one tick, in its own frame: translation [m], rotation vector [rad].
-inline constexpr int kTwistDim = 6;
-
 struct Action {
   JointVector dq_step = JointVector::Zero();  // step of the joint target [rad a tick]
   bool gripper_closed = false;
@@ -39,8 +36,7 @@ struct Action {
   Eigen::Matrix<float, kEnvironmentActionDim, 1> object_motion = Eigen::Matrix<float, kEnvironmentActionDim, 1>::Zero();
 };
 
-// What stands before and behind the network pi: features and scales. pi says where the joints go and how the tip moves;
-// both add up, once for the command and once for what the joints will have moved. Real-time safe but for the constructor.
+// What stands before and behind the network pi: features and scales. Real-time safe but for the constructor.
 class PolicyCodec {
  public:
   // Throws std::runtime_error with one line that names what in the manifest does not fit.
@@ -52,21 +48,20 @@ class PolicyCodec {
   void Encode(const StateVector& s, const LatentVector& z, float phase, float* x) const noexcept;
   // From pi's heads, each at its first value. kInvalidInput if one is not finite.
   struct Heads {
-    const float *agent, *environment, *response, *carried, *twist;
+    const float *agent, *environment, *response, *carried;
   };
   Status Decode(const Observation& observation, const Heads& heads, Action& action) const noexcept;
   // The observation a tick later if it goes as `action` foretells.
   void Advance(const Action& action, Observation& observation) const noexcept;
 
   const ArmModel& arm() const { return arm_; }
-  int agent_head, environment_head, response_head, carried_head, twist_head;
+  int agent_head, environment_head, response_head, carried_head;
 
  private:
   ArmModel arm_;
   Normalizer normalizer_;
   Eigen::Matrix<float, kAgentActionDim, 1> agent_scale_;
   Eigen::Matrix<float, kNumJoints, 1> response_scale_;
-  Eigen::Matrix<float, kTwistDim, 1> twist_scale_;
   Eigen::Matrix<float, kEnvironmentActionDim, 1> environment_scale_;
 };
 

@@ -11,8 +11,6 @@ import torch
 from torch import Tensor
 
 NEAR = 0.01  # m, kNear of skills/state.h
-ANGLE_WEIGHT = 0.1  # m/rad, kAngleWeight of skills/policy.cc
-DAMPING = 0.01  # m, kDamping there, of singular values that are .05 and more in the work space
 
 
 def rotation(quaternion: np.ndarray) -> np.ndarray:
@@ -81,31 +79,6 @@ class Arm(torch.nn.Module):
             link = torch.cat([pairs, link[..., n:, :, :]], -3)
         X = link[..., 0, :, :] @ self.X[-1]
         return X[..., :3, 3], X[..., :3, :3]
-
-    def jacobian(self, q: Tensor) -> Tensor:
-        """q (..., 6) -> (..., 6, 6): linear [m/rad], then angular velocity of the tip, both in the tip's frame."""
-        c, s = torch.cos(q), torch.sin(q)
-        o, one = torch.zeros_like(c), torch.ones_like(c)
-        turn = torch.stack([c, -s, o, o, s, c, o, o, o, o, one, o, o, o, o, one], -1).unflatten(-1, (4, 4))
-        link = self.X[:-1] @ turn
-        frames = [link[..., 0, :, :]]
-        for i in range(1, 6):
-            frames.append(frames[-1] @ link[..., i, :, :])
-        X_WG = frames[-1] @ self.X[-1]
-        frames = torch.stack(frames, -3)  # (..., 6, 4, 4)
-        axis, arm = frames[..., :3, 2], X_WG[..., None, :3, 3] - frames[..., :3, 3]
-        both = torch.stack([torch.linalg.cross(axis, arm), axis], -3)  # (..., 2, 6, 3)
-        both = both @ X_WG[..., None, :3, :3]  # rows in the tip's axes
-        return both.transpose(-1, -2).flatten(-3, -2)
-
-    def joint_steps(self, q: Tensor, twist: Tensor) -> Tensor:
-        """The joint displacements (..., n, 6) [rad] that move the tip as twists (..., n, 6) say: [m], [rad], in its
-        frame; damped least squares (Nakamura & Hanafusa 1986), angles weighed by ANGLE_WEIGHT."""
-        weight = torch.tensor([1.0] * 3 + [ANGLE_WEIGHT] * 3, device=q.device)
-        J = self.jacobian(q) * weight[:, None]
-        JT = J.transpose(-1, -2)
-        damped = JT @ J + DAMPING**2 * torch.eye(6, device=q.device)
-        return torch.linalg.solve(damped, JT @ (twist * weight).transpose(-1, -2)).transpose(-1, -2)
 
 
 def state_features(

@@ -190,7 +190,7 @@ class InteractionAbstractions(nn.Module):
         )
         heads = {"agent": space.agent, "environment": space.change_dim}
         if lite6:
-            heads["response"], heads["carried"], heads["twist"] = space.joints, space.slots, 12
+            heads["response"], heads["carried"] = space.joints, space.slots
         self.pi = Recurrent(space.state_dim + BASIS + 2 * LATENT * (BASIS + 1), heads=heads, **config["pi"])
         self.eta = Recurrent(
             space.state_dim + 2 * LATENT + 1, heads={"mean": 2 * LATENT, "log_std": 2 * LATENT, "b": 1}, **config["eta"]
@@ -227,21 +227,12 @@ class InteractionAbstractions(nn.Module):
         held = torch.nn.functional.pad(held, (0, change.shape[-1] - held.shape[-1]))
         return change + held * carried
 
-    def moves(self, y: dict[str, Tensor], agent: Tensor) -> tuple[Tensor, Tensor]:
-        """Heads at states of the agent (..., agent) -> a^r (..., agent) in units of its scale, and how far the agent
-        will have moved (..., joints)."""
-        space = self.space
-        if space.arm is None:
-            return y["agent"], space.respond(y["agent"])
-        command, response = space.servo(agent, y["twist"])
-        command = torch.nn.functional.pad(command / space.command_scale[:-1], (0, 1))
-        return y["agent"] + command, space.respond(y["response"]) + response
-
     def rollout(self, start: State, z: Tensor, age: Tensor, ticks: Tensor, hard: bool = True) -> tuple[State, Tensor]:
         """Closed on its own predictions. start (B, ...), z (B, N, 16), age and ticks (B, N): of the running skill; a
         skill begins with zero memory. hard: the gripper is set, not moved half. The N states after `start`,
         (B, N, ...), and a^r (B, N, agent)."""
         space, state, memory, states, commands = self.space, start, None, [], []
+        moves = "agent" if space.arm is None else "response"
         basis = phase_basis(phase(age, ticks))
         for t in range(z.shape[1]):
             s, tip = space.features(state)
@@ -249,14 +240,14 @@ class InteractionAbstractions(nn.Module):
                 keep = (age[:, t] > 0).to(s.dtype)[:, None]
                 memory = [(h * keep, c * keep) for h, c in memory]
             y, memory = self.pi.step(self.policy_input(s, z[:, t], basis[:, t]), memory)
-            (command, response), gripper = self.moves(y, state.agent), None
+            response, gripper = space.respond(y[moves]), None
             if space.arm is not None:
                 gripper = y["agent"][..., -1]
                 gripper = torch.where(gripper > 0, 1.0, -1.0) if hard else gripper.clamp(-1, 1)
             carried = space.carried(state, tip, state.agent[..., : space.joints] + response)
             state = space.move(state, tip, response, self.change(y, carried), gripper)
             states.append(state)
-            commands.append(command)
+            commands.append(y["agent"])
         return State.join(states, stack=1), torch.stack(commands, 1)
 
     def load_tensors(self, tensors: dict[str, Tensor]) -> None:

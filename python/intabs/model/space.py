@@ -82,7 +82,6 @@ class Space(nn.Module):
             ("command_scale", agent),
             ("response_scale", self.joints),
             ("change_scale", self.change_dim),
-            ("twist_scale", 6),
         ):
             self.register_buffer(name, torch.ones(n))
 
@@ -120,10 +119,6 @@ class Space(nn.Module):
         if self.arm is not None:
             commands = torch.from_numpy(np.concatenate([c for _, c in demos]))
             self.command_scale[:-1] = _rms(commands[:, :-1], 1e-4)  # not centred: no command is no motion
-            q = torch.cat([s.agent[:-1, :-1] for s, _ in demos])
-            twist = (self.arm.jacobian(q) @ response[..., None])[..., 0]
-            for k in (0, 3):
-                self.twist_scale[k : k + 3] = _rms(twist[:, k : k + 3].reshape(-1), 1e-4)
 
     def normalizer(self) -> dict:
         """As the runtime reads it (cpp/intabs/skills/policy.cc)."""
@@ -133,7 +128,6 @@ class Space(nn.Module):
             "agent_action_scale": self.command_scale.tolist(),
             "environment_action_scale": self.change_scale.tolist(),
             "response_scale": self.response_scale.tolist(),
-            "twist_scale": self.twist_scale.tolist(),
             "limit": LIMIT,
         }
 
@@ -141,7 +135,6 @@ class Space(nn.Module):
         names = {
             "mean": "state_mean", "scale": "state_scale", "command_scale": "agent_action_scale",
             "change_scale": "environment_action_scale", "response_scale": "response_scale",
-            "twist_scale": "twist_scale",
         }  # fmt: skip
         for buffer, name in names.items():
             getattr(self, buffer).copy_(torch.tensor(d[name]))
@@ -201,12 +194,6 @@ class Space(nn.Module):
         else:
             p, R = kinematics.move_objects(s.p, s.R, tip[1], motion)
         return State(agent, p, R, s.environment + change[..., 6 * self.slots :], s.known, s.valid)
-
-    def servo(self, agent: Tensor, twist: Tensor) -> tuple[Tensor, Tensor]:
-        """pi's head `twist` (..., 12) at states of the Lite 6 -> joint displacements [rad] of the command and of the
-        response, (..., 6) each."""
-        twists = squash(twist).unflatten(-1, (2, 6)) * self.twist_scale
-        return self.arm.joint_steps(agent[..., :-1], twists).unbind(-2)
 
     def respond(self, response: Tensor) -> Tensor:
         """pi's output -> displacement of the agent."""

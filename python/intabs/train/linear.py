@@ -29,7 +29,7 @@ def start_linear(
     space = model.space
     rng = np.random.default_rng(seed)
     pooled: dict[str, list[Tensor]] = {name: [] for name in model.encoders}
-    outputs: dict[str, list[Tensor]] = {name: [] for name in model.pi.heads if name not in ("carried", "twist")}
+    outputs: dict[str, list[Tensor]] = {name: [] for name in model.pi.heads if name != "carried"}
     gram, ticks = torch.zeros(BASIS, BASIS), []
     for _ in range(BATCHES):
         w = sampler.sample(SIZE, rng)
@@ -90,7 +90,6 @@ def start_linear(
         latents.append(inputs @ W + b)
     if "carried" in model.pi.heads:
         _set_skip(model.pi, "carried", torch.zeros(1, space.slots), torch.full((space.slots,), NOT_HELD), first=0)
-        _set_skip(model.pi, "twist", torch.zeros(1, 12), torch.zeros(12), first=0)
     z = torch.cat(latents, -1)
     for name, c in coefficients.items():
         W, b = _ridge(z, c.flatten(1), 1e-3)

@@ -11,6 +11,7 @@ from intabs.model import kinematics
 from intabs.model.space import State
 
 REACH, UNIT = 0.08, 0.02  # m
+TURN_LENGTH = 0.1  # m/rad, as kTurnLength of skills/skill_player.h
 FLIPPED = 0.03  # of the rollouts begin with the gripper the other way round
 
 
@@ -74,11 +75,11 @@ def pushed(s: State, rad: float, rest_ticks: int, rng) -> tuple[Tensor, Tensor]:
 
 def near_error(got: State, want: State, arm: kinematics.Arm, mask: Tensor) -> Tensor:
     """How far a rollout of the Lite 6 stays from the demonstration where it counts: known objects seen from the
-    tip, |dp| + ANGLE_WEIGHT * angle in units of 2 cm, weighed by 1 / (1 + (distance from the tip / REACH)^2).
+    tip, |dp| + TURN_LENGTH * angle in units of 2 cm, weighed by 1 / (1 + (distance from the tip / REACH)^2).
     (B, N, ...)."""
     p, R = (list(x) for x in zip(*(_seen_from_tip(s, arm) for s in (got, want)), strict=True))
     apart = torch.sqrt(((p[0] - p[1]) ** 2).sum(-1) + 1e-8)
-    apart = apart + kinematics.ANGLE_WEIGHT * kinematics.angle_between(R[0], R[1])
+    apart = apart + TURN_LENGTH * kinematics.angle_between(R[0], R[1])
     weight = want.known / (1 + (p[1] ** 2).sum(-1) / REACH**2)
     return mean_over((apart / UNIT * weight).sum(-1), mask)
 

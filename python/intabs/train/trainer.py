@@ -254,15 +254,13 @@ class Trainer:
 
     def _on_recorded_states(self, batch: Windows, state: torch.Tensor, z, response, change, carried) -> dict:
         """pi on the Lite 6's recorded states: its commands, which no kinematic rollout can tell, and all else."""
-        space = self.model.space
         seen, carried, change = batch.pieces(state), batch.pieces(carried), batch.pieces(change)
         age = torch.arange(seen.shape[1], device=seen.device, dtype=seen.dtype)[None]
         basis = phase_basis(phase(age, batch.within.sum(1, keepdim=True)))
         y = self.model.pi(self.model.policy_input(seen, z[:, None].expand(-1, seen.shape[1], -1), basis))
-        command, moved = self.model.moves(y, batch.pieces(batch.state[:, :-1].agent))
         return {
-            "agent": action_error(command, batch.pieces(batch.command), batch.within),
-            "response": action_error(moved / space.response_scale, batch.pieces(response), batch.within),
+            "agent": action_error(y["agent"], batch.pieces(batch.command), batch.within),
+            "response": action_error(y["response"], batch.pieces(response), batch.within),
             "environment": action_error(self.model.change(y, carried), change, batch.within),
             "held": held_error(y["carried"], change, carried, batch.within),
         }

@@ -26,11 +26,8 @@ inline WeightsFile RandomPolicyWeights(int inputs = kPolicyInputDim, const std::
   pi.layers = 8;
   pi.hidden = 128;
   pi.residual = true;
-  pi.heads = {{"agent", kAgentActionDim},
-              {"environment", kEnvironmentActionDim},
-              {"response", kNumJoints},
-              {"carried", kMaxObjects},
-              {"twist", 2 * kTwistDim}};
+  pi.heads = {
+      {"agent", kAgentActionDim}, {"environment", kEnvironmentActionDim}, {"response", kNumJoints}, {"carried", kMaxObjects}};
   NetworkSpec eta;
   eta.input = kTerminationInputDim;
   eta.layers = 1;
@@ -49,7 +46,6 @@ inline WeightsFile RandomPolicyWeights(int inputs = kPolicyInputDim, const std::
                             ",\"state_scale\":" + Numbers(kStateDim, 0.5) +
                             ",\"agent_action_scale\":" + Numbers(kAgentActionDim, 0.01) +
                             ",\"response_scale\":" + Numbers(kNumJoints, 0.01) +
-                            ",\"twist_scale\":" + Numbers(kTwistDim, 0.005) +
                             ",\"environment_action_scale\":" + Numbers(kEnvironmentActionDim, 0.01) + ",\"limit\":5},";
   const std::string sha = Sha256Hex(image.data(), image.size());
   return WeightsFile::Parse(std::move(image),
