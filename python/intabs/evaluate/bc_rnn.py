@@ -124,8 +124,13 @@ def train_task(out: Path, data: Path, replays: Path | None, task: str, minutes: 
 
 
 def run_policy(out: Path, task: str, trials: int, spread: float) -> list[bool]:
-    """Closed loop in the plant, truth, seeds as `intabs rollout` has them. Success is what lasts for HELD ticks."""
+    """Closed loop in the plant, truth, seeds as `intabs rollout` has them. Success is what lasts for HELD ticks. What
+    was run before is kept."""
     import torch
+
+    kept = out / f"{spread:g}cm.json"
+    if kept.exists() and len(json.loads(kept.read_text())) >= trials:
+        return json.loads(kept.read_text())[:trials]
 
     about = json.loads((out / "about.json").read_text())
     _, policy = make_policy(about["learning_rate"])
@@ -156,6 +161,7 @@ def run_policy(out: Path, task: str, trials: int, spread: float) -> list[bool]:
                     break
             done.append(lasted == HELD or bool(session.success))
             progress.update(trial + 1, f"{sum(done)} of {len(done)} succeeded")
+    kept.write_text(json.dumps(done))
     return done
 
 
