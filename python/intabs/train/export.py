@@ -30,6 +30,7 @@ SCHEMA = 1
 SEGMENT = 14  # ticks of a skill on which the formats are compared
 GOLDEN_TICKS = 40
 PRACTICE_CM, PRACTICE_SEED = 3.0, 500_000
+MORE = 4  # times as many tries where it is not clear which demonstration does best
 TOLERANCE = 1e-5
 
 
@@ -71,18 +72,26 @@ def write_library(out: Path, library: dict) -> None:
     (out / "skills.json").write_text(json.dumps(library, separators=(",", ":")))
 
 
-def practise(out: Path, library: dict, trials: int, jobs: int, progress) -> list[int]:
+def practise(
+    out: Path, library: dict, tries: range, jobs: int, progress, only: list[tuple[str, str]] | None = None
+) -> list[int]:
     """How often the skills of each demonstration do their task in the plant: truth, objects within PRACTICE_CM,
-    seeds of its own."""
+    seeds of its own. only: of these (task, demonstration)."""
     write_library(out, library)
     chains = list(Library.load(out).chains)
     work = [(Setting(task, str(out), PRACTICE_CM, "truth", PRACTICE_SEED, "", source=source), i)
-            for task, source in sorted(chains) for i in range(trials)]  # fmt: skip
+            for task, source in sorted(only or chains) for i in tries]  # fmt: skip
     won = dict.fromkeys(chains, 0)
     for done, ((setting, _), result) in enumerate(zip(work, in_processes(run_trial, work, jobs), strict=True)):
         won[setting.task, setting.source] += result["success"]
         progress(done / len(work), f"{setting.task}: {setting.source}")
     return list(won.values())
+
+
+def unsure(chains: list[tuple[str, str]], won: list[int], tries: int) -> list[tuple[str, str]]:
+    """Where no demonstration of a task always did it, the best ones: few tries hardly tell them apart."""
+    best = {task: max(w for (t, _), w in zip(chains, won, strict=True) if t == task) for task, _ in chains}
+    return [c for c, w in zip(chains, won, strict=True) if best[c[0]] < tries and w >= max(best[c[0]] - 1, 1)]
 
 
 def export(
@@ -149,16 +158,21 @@ def export(
     cuts = [boundaries.cuts(state_of(d)[0]).tolist() for d in demos]
     even = [fixed_cuts(len(d), SEGMENT + 1) for d in demos]
     if practice:
-        rates = [practise(out, library_of(model, demos, names, c), practice, jobs, progress) for c in (even, cuts)]
+        tries = range(practice)
+        rates = [practise(out, library_of(model, demos, names, c), tries, jobs, progress) for c in (even, cuts)]
         # Skills of a fixed length where they do better.
         cuts = [e if a > b else c for a, b, c, e in zip(*rates, cuts, even, strict=True)]
     library = library_of(model, demos, names, cuts)
     if practice:
-        best = [max(x) for x in zip(*rates, strict=True)]
+        chains = [(str(d.attrs["task"]), n) for d, n in zip(demos, names, strict=True)]
+        won = [max(x) for x in zip(*rates, strict=True)]
+        more = unsure(chains, won, practice)
+        again = practise(out, library, range(practice, MORE * practice), jobs, progress, more) if more else won
         library["practice"] = [
-            {"task": str(d.attrs["task"]), "source": n, "trials": practice, "success": k}
-            for d, n, k in zip(demos, names, best, strict=True)
-        ]
+            {"task": c[0], "source": c[1], "trials": (MORE if c in more else 1) * practice,
+             "success": w + (a if c in more else 0)}
+            for c, w, a in zip(chains, won, again, strict=True)
+        ]  # fmt: skip
     write_library(out, library)
 
     error = verify(out)
