@@ -190,6 +190,15 @@ def test_movement_primitives_come_close_to_the_motion_they_are_fitted_to(train, 
     assert got["all"] < 0.3 * errors(Still().reconstruct(of(m), [0, 79]), m, scaling)["all"]
 
 
+def test_mcnemar_counts_the_trials_that_only_one_did():
+    from intabs.evaluate.bc_rnn import mcnemar
+
+    ours, theirs = [True] * 9 + [False] * 3, [True] * 3 + [False] * 8 + [True]
+    assert mcnemar(ours, theirs)[:2] == (6, 1)
+    assert abs(mcnemar(ours, theirs)[2] - 2 * (1 + 7) / 2**7) < 1e-12  # both tails of 7 throws of a coin
+    assert mcnemar(ours, ours) == (0, 0, 1.0)
+
+
 def test_neighbours_vote_and_the_nearer_decides_a_tie():
     from intabs.evaluate.knn import confusion, label_pieces, neighbours
 

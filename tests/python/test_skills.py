@@ -16,7 +16,7 @@ from intabs.evaluate.metrics import sample  # noqa: E402
 from intabs.rollout import displaced_cm, rollout  # noqa: E402
 from intabs.skills.library import EFFECT, Frame, Library, drawing  # noqa: E402
 from intabs.skills.planner import Effect, Goal, Planner, goals_of, load_goals, missing, seen_from, whole  # noqa: E402
-from intabs.train.export import export, load_weights  # noqa: E402
+from intabs.train.export import export, load_weights, unsure  # noqa: E402
 from intabs.train.trainer import Trainer, load_config  # noqa: E402
 
 
@@ -183,6 +183,11 @@ def test_displacement_is_that_of_the_farthest_object(library):
     pose = first.object_pose.copy()
     pose[1, 0] += 1
     assert 90 < displaced_cm(library, "pick_place", Frame(first.q, False, pose, first.known)) < 110
+
+
+def test_where_practice_cannot_tell_the_best_try_more():
+    chains = [("a", "1"), ("a", "2"), ("a", "3"), ("b", "4"), ("b", "5"), ("c", "6")]
+    assert unsure(chains, [3, 2, 1, 4, 3, 0], 4) == [("a", "1"), ("a", "2")]
 
 
 def test_a_run_needs_a_scene(made, library):
