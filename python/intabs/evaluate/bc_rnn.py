@@ -33,10 +33,11 @@ def load_robomimic():
     if not packages.find("robomimic"):
         raise UserError(f"robomimic is not installed: {packages.CURE}")
     packages.without_pictures()
-    import robomimic.algo
-    import robomimic.config
-    import robomimic.utils.dataset
-    import robomimic.utils.obs_utils
+    with contextlib.redirect_stdout(io.StringIO()):  # it misses a file of private settings
+        import robomimic.algo
+        import robomimic.config
+        import robomimic.utils.dataset
+        import robomimic.utils.obs_utils
 
     return robomimic.algo, robomimic.config, robomimic.utils.dataset, robomimic.utils.obs_utils
 
@@ -195,7 +196,11 @@ def main() -> int:
                 train_task(a.out / task, a.data, a.replays, task, a.minutes, a.learning_rate)
             for task in a.tasks:
                 report = a.out / task / f"{Path(a.weights).name}_{a.spread:g}cm"
-                rollout(task, a.trials, a.spread, a.weights, "truth", report=report, resume=True)
+                with Progress(f"rollout of ours, {task}", total=a.trials) as progress:
+                    rollout(
+                        task, a.trials, a.spread, a.weights, "truth", report=report, resume=True,
+                        progress=progress.update,
+                    )  # fmt: skip
                 lines = [json.loads(x) for x in (report / "trials.jsonl").read_text().splitlines()[1:]]
                 good = {x["trial"]: bool(x["success"]) for x in lines}
                 ours.append([good[i] for i in range(a.trials)])
