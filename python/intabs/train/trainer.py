@@ -151,6 +151,8 @@ class Trainer:
         self, config: dict, data: Path | str, run: Path | str, seed: int, device: str, replays: Path | str | None = None
     ):
         self.rank, self.world, device = join_others(device)
+        if config["train"]["batch"] < self.world:
+            raise UserError(f"train.batch is {config['train']['batch']}: fewer windows than processes ({self.world})")
         self.config, self.data, self.run, self.seed, self.device = config, Path(data), Path(run), seed, device
         self.replays = Path(replays) if replays else None
         torch.manual_seed(seed)

@@ -25,6 +25,8 @@ class Demonstration:
 
 @dataclass
 class Ours:
+    """Which windows and skills of a batch are those of one process."""
+
     windows: int  # of all processes
     rows: slice  # those of this one
     skills: int
