@@ -181,6 +181,42 @@ def test_learned_cuts_are_where_skills_begin(demonstrations):
     assert set(begins) <= starts
 
 
+def test_a_window_with_a_lead_is_cut_where_the_lead_ends(demonstrations):
+    found, space = demonstrations
+    sampler = WindowSampler(found, space, 40, (8, 24))
+    assert sampler.longest_lead == min(len(d.state.agent) for d in found) - 9
+    whole = sampler.sample(32, np.random.default_rng(0), lead=60)
+    before, after = whole.split(60)
+    assert before.skill.shape == (32, 60) and after.skill.shape == (32, 40) and before.mask.all()
+    assert torch.equal(before.state.agent[:, -1], after.state.agent[:, 0])
+    for part, state in ((before, whole.state[:, :61]), (after, whole.state[:, 60:])):
+        assert torch.equal(part.state.p, state.p)
+        skill = part.skill.flatten()
+        for m, n in enumerate(part.within.sum(1).long()):
+            assert (skill[part.gather[m, :n]] == m).all()
+        assert (part.age[:, 0] == 0).all() and part.skill.max() + 1 == len(part.within)
+    assert after.within.sum() == after.mask.sum() and torch.equal(after.mask, whole.mask[:, 60:])
+
+
+def test_a_rollout_that_has_lost_the_thread_begins_where_the_demonstration_is(data, tmp_path):
+    trainer = train(data, tmp_path / "run", stop_at=1)
+    batch = trainer.sampler.sample(16, np.random.default_rng(0), lead=80)
+    before, after = batch.split(80)
+    recorded = after.state[:, 0]
+    with torch.no_grad():
+        ended = trainer.model.rollout(
+            before.state[:, 0], trainer._encode(before)[0][before.skill], before.age, before.ticks
+        )[0][:, -1]
+        led = trainer._led_to(before, recorded)
+    apart = ((ended.p - recorded.p).norm(dim=-1) * recorded.known).amax(1)
+    kept = (led.agent == ended.agent).all(1)
+    assert (led.agent == recorded.agent).all(1)[~kept].all() and (apart[kept] <= 0.03).all()
+    assert (led.p[~kept] == recorded.p[~kept]).all() and kept.sum() > 0
+    far = recorded.map(lambda x: x)
+    far.p = recorded.p + 1.0
+    assert (trainer._led_to(before, far).p == far.p).all()
+
+
 def test_turning_the_scene_about_the_base_changes_no_feature_but_joint_1(demonstrations):
     found, space = demonstrations
     w = WindowSampler(found, space, 30, (8, 24)).sample(8, np.random.default_rng(0))

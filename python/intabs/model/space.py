@@ -37,6 +37,11 @@ class State:
     def __getitem__(self, index) -> State:
         return self.map(lambda x: x[index])
 
+    def either(self, other: State, mine: Tensor) -> State:
+        """Rows (B, ...) of this one where mine (B,) is true, of the other elsewhere."""
+        parts = ((getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+        return State(*(torch.where(mine.reshape(-1, *[1] * (a.dim() - 1)), a, b) for a, b in parts))
+
     @staticmethod
     def join(states: list[State], stack: int | None = None, cat: int = 0) -> State:
         """Stacked along a new dimension, or concatenated."""

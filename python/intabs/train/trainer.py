@@ -21,7 +21,7 @@ from intabs.data.reader import DemoFile
 from intabs.errors import UserError
 from intabs.evaluate.metrics import Scaling, motion_of
 from intabs.model.networks import InteractionAbstractions, encoder_inputs, phase, phase_basis
-from intabs.model.space import Space, state_of
+from intabs.model.space import Space, State, state_of
 from intabs.replay.replay import RETURN
 from intabs.train.boundaries import Boundaries
 from intabs.train.linear import start_linear
@@ -41,6 +41,7 @@ from intabs.train.windows import Demonstration, Windows, WindowSampler, disturbe
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 CHECKPOINT_EVERY = 500
 VALIDATE_EVERY = 250
+LOST, LOST_M = 1.0, 0.03  # a rollout so far from the demonstration [deviations of the training split; m] is given up
 PUSH_TICKS = 20  # by then a push has faded to a twelfth
 CHOICE = 0.02  # of eta's loss for the next skill [nat] beside that for the end of the running one [nat a tick]
 
@@ -201,16 +202,36 @@ class Trainer:
         x = (step - t["warmup"]) / max(1, t["steps"] - t["warmup"])
         return 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * min(x, 1.0)))
 
-    def _loss(self, batch: Windows, rng: np.random.Generator | None, joint: bool = False) -> tuple[torch.Tensor, dict]:
-        """rng: of z's noise and of the disturbances pi sees; None: z at its mean, no disturbance. joint: with eta."""
+    def _encode(self, batch: Windows) -> tuple[torch.Tensor, torch.Tensor]:
+        """Mean and log of the standard deviation of z (M, 16) of what the batch shows."""
+        space = self.model.space
+        shown = (space.features(batch.shown[:, :-1])[0], *space.between(batch.shown[:, :-1], batch.shown[:, 1:]))
+        inputs = encoder_inputs(space, shown[0], batch.shown_command, *shown[1:])
+        return self.model.encode(*(batch.pieces(x) for x in inputs), batch.within)
+
+    @torch.no_grad()
+    def _led_to(self, before: Windows, recorded: State) -> State:
+        """Where pi's own rollout through `before` ends, (B, ...); `recorded` where it has lost the thread."""
+        z = self._encode(before)[0]
+        end = self.model.rollout(before.state[:, 0], z[before.skill], before.age, before.ticks)[0][:, -1]
+        joints = self.model.space.joints
+        strayed = ((end.agent - recorded.agent) / self.model.space.scale[: end.agent.shape[-1]]).abs()[:, :joints]
+        lost = strayed.amax(1) > LOST
+        if recorded.p.shape[1]:
+            lost |= ((end.p - recorded.p).norm(dim=-1) * recorded.known).amax(1) > LOST_M
+        return end.either(recorded, ~lost)
+
+    def _loss(
+        self, batch: Windows, rng: np.random.Generator | None, joint: bool = False, before: Windows | None = None
+    ) -> tuple[torch.Tensor, dict]:
+        """rng: of z's noise and of the disturbances pi sees; None: z at its mean, no disturbance. joint: with eta.
+        before: rollouts begin where pi has come through these."""
         o, model = self.config["objective"], self.model
         space = model.space
         now, after = batch.state[:, :-1], batch.state[:, 1:]
         state, tip = space.features(now)
         change = space.between(now, after)
-        shown = (space.features(batch.shown[:, :-1])[0], *space.between(batch.shown[:, :-1], batch.shown[:, 1:]))
-        inputs = encoder_inputs(space, shown[0], batch.shown_command, *shown[1:])
-        mean, log_std = model.encode(*(batch.pieces(x) for x in inputs), batch.within)
+        mean, log_std = self._encode(batch)
         z = mean
         if rng is not None:
             of_windows, of_skills = batch.chance(rng)
@@ -223,15 +244,20 @@ class Trainer:
             carried = space.carried(now, tip, after.agent[..., : space.joints])
             terms.update(self._on_recorded_states(batch, state, z, *change, carried))
 
-        # pi on its own predictions, which on the Lite 6 may begin beside the demonstration and are to come back to it.
+        # pi on its own predictions, which may begin beside the demonstration and are to come back to it.
         start, want = now[:, 0], after
-        if space.arm is not None and rng is not None:
+        if before is not None:
+            start = self._led_to(before, start)
+        elif space.arm is not None and rng is not None:
             push, flip = pushed(batch.state, o["push"], PUSH_TICKS, of_windows)
-            fades = (1 - RETURN) ** torch.arange(now.agent.shape[1] + 1, device=push.device)[:, None]
-            push = torch.nn.functional.pad(push[:, None] * fades, (0, 1))  # (B, N + 1, A)
-            agent = torch.cat([start.agent[:, :-1], start.agent[:, -1:] * flip[:, None]], 1)
-            start = replace(start, agent=agent + push[:, 0])
-            want = replace(after, agent=after.agent + push[:, 1:])
+            agent = torch.cat([start.agent[:, :-1] + push, start.agent[:, -1:] * flip[:, None]], 1)
+            start = replace(start, agent=agent)
+        push = (start.agent - now.agent[:, 0])[:, None, : space.joints]
+        fades = (1 - RETURN) ** torch.arange(1, now.agent.shape[1] + 1, device=push.device)[:, None]
+        want = replace(
+            after,
+            agent=torch.cat([after.agent[..., : space.joints] + push * fades, after.agent[..., space.joints :]], -1),
+        )
         rolled, commands = model.rollout(start, z[batch.skill], batch.age, batch.ticks, hard=rng is None)
         groups = self.rollout_error(rolled, want, batch.mask)
         terms.update(zip(("joints", "position", "orientation"), groups, strict=True))
@@ -307,13 +333,19 @@ class Trainer:
 
     def one_step(self) -> tuple[torch.Tensor, dict]:
         """One batch, one update."""
-        # First skills of all lengths from anywhere; then half of the time those of the learned boundaries, with eta.
+        # First skills of all lengths from anywhere; then half of the time those of the learned boundaries, with eta,
+        # the other half from where pi has come by itself.
         t = self.config["train"]
-        joint = self.step >= self.config["objective"]["joint_from"] * t["steps"] and self.step % 2 == 0
+        o = self.config["objective"]
+        late = self.step >= o["joint_from"] * t["steps"]
+        joint = late and self.step % 2 == 0
         sampler = self.joint_sampler if joint else self.sampler
-        batch = sampler.sample(t["batch"], self.rng)
-        ours = batch.share(self.rank, self.world) if self.world > 1 else batch
-        loss, terms = self._loss(ours.to(self.device), self.rng, joint)
+        lead = min(o["lead"], sampler.longest_lead) if late and not joint else 0
+        lead = int(self.rng.integers(lead + 1)) if lead else 0
+        batch = sampler.sample(t["batch"], self.rng, lead)
+        parts = batch.split(lead) if lead else (None, batch)
+        before, ours = (x.share(self.rank, self.world).to(self.device) if x else None for x in parts)
+        loss, terms = self._loss(ours, self.rng, joint, before)
         self.optimizer.zero_grad()
         loss.backward()
         if self.world > 1:

@@ -84,6 +84,30 @@ class Windows:
             ours=Ours(len(self.skill), rows, len(self.gather), mine.numpy()),
         )
 
+    def split(self, ticks: int) -> tuple[Windows, Windows]:
+        """The first ticks, where every window has a cut, and the rest."""
+        steps = self.skill.shape[1]
+        first = self.gather[:, 0] % steps < ticks
+        both = []
+        for mine, a, b in ((first, 0, ticks), (~first, ticks, steps)):
+            parts = {k: getattr(self, k)[:, a:b] for k in ("mask", "age", "ticks")}
+            states = {k: getattr(self, k)[:, a : b + 1] for k in ("state", "shown")}
+            commands = {k: x if (x := getattr(self, k)) is None else x[:, a:b] for k in ("command", "shown_command")}
+            gather, within = self.gather[mine], self.within[mine]
+            longest = int(within.sum(1).max())
+            gather, within = gather[:, :longest], within[:, :longest]
+            both.append(
+                Windows(
+                    **parts, **states, **commands,
+                    skill=(mine.long().cumsum(0) - 1)[self.skill[:, a:b]],
+                    gather=gather // steps * (b - a) + gather % steps - a,
+                    within=within,
+                    whole=self.whole[mine],
+                    names=self.names,
+                )
+            )  # fmt: skip
+        return both[0], both[1]
+
     def chance(self, rng: np.random.Generator) -> tuple[Chance, Chance]:
         """For draws a window, and draws a skill."""
         o = self.ours or Ours(len(self.skill), slice(None), len(self.gather), slice(None))
@@ -134,6 +158,7 @@ class WindowSampler:
         self.strangers = strangers if space.arm is not None else 0.0
         self.ticks, self.segment, self.augment = ticks, segment, augment or {}
         self.count = np.array([len(d.state.agent) - 1 for d in demonstrations])
+        self.longest_lead = int(max(0, self.count.min() - segment[0]))
         self.first = np.concatenate([[0], np.cumsum(self.count + 1)])
         self.state = State.join([d.state for d in demonstrations])
         # For each slot the ticks that know it: strangers come from there.
@@ -160,6 +185,8 @@ class WindowSampler:
 
     def _cut(self, demo: int, start: int, ticks: int, low: int, high: int, rng: np.random.Generator) -> list[int]:
         """Lengths of the skills of a window of `ticks` ticks: learned, or drawn from low .. high."""
+        if not ticks:
+            return []
         if self.cuts is not None:
             inside = self.cuts[demo] - start
             inside = inside[(inside > 0) & (inside < ticks)]
@@ -170,10 +197,12 @@ class WindowSampler:
             lengths.append(left if left - n < low else n)
         return lengths
 
-    def sample(self, n: int, rng: np.random.Generator) -> Windows:
-        """`rng` is the whole source of chance."""
+    def sample(self, n: int, rng: np.random.Generator, lead: int = 0) -> Windows:
+        """`rng` is the whole source of chance. lead: ticks more, before the window, with a cut where it begins; no more
+        than `longest_lead`."""
         demo, start = self._pick(n, rng)
-        steps = self.ticks
+        start = np.maximum(start - lead, 0)
+        steps = lead + self.ticks
         # Short skills are as likely as long ones; those of a batch are of similar length, as padding costs time.
         low, high = np.log(self.segment)
         middle = np.exp(rng.uniform(low, high))
@@ -184,9 +213,9 @@ class WindowSampler:
         skill, age, ticks = (np.zeros((n, steps), "i8") for _ in range(3))
         pieces: list[tuple[int, int]] = []
         for b in range(n):
-            within = min(steps, int(last[b, 0] - start[b]))
-            at = 0
-            for length in self._cut(int(demo[b]), int(start[b]), within, low, high, rng):
+            within, at = min(steps, int(last[b, 0] - start[b])), 0
+            lengths = self._cut(int(demo[b]), int(start[b]), lead, low, high, rng)
+            for length in lengths + self._cut(int(demo[b]), int(start[b]) + lead, within - lead, low, high, rng):
                 skill[b, at : at + length] = len(pieces)
                 age[b, at : at + length] = np.arange(length)
                 ticks[b, at : at + length] = length
