@@ -6,8 +6,6 @@ import numpy as np
 
 from intabs.data.demos import Demo
 from intabs.evaluate.learned import Learned
-from intabs.model.space import state_of
-from intabs.train.boundaries import Boundaries
 
 TOLERANCE = 3  # frames
 
@@ -48,9 +46,9 @@ def mean_times(train: list[Demo], demo: Demo) -> np.ndarray:
 def score_boundaries(method: Learned, train: list[Demo], held_out: list[Demo]) -> dict:
     """precision, recall, f1 of the learned cuts of held-out demonstrations; f1 of the best fixed length (chosen on the
     training split) and of the mean times of the training split's labels."""
-    model = Boundaries(method.model.space, [state_of(d)[0] for d in train], method.config["objective"]["boundaries"])
+    found = [cuts[1:-1] for cuts in method.cuts(train, held_out)]
     true = [label_changes(d) for d in held_out]
-    precision, recall, f1 = precision_recall_f1([model.cuts(state_of(d)[0])[1:-1] for d in held_out], true)
+    precision, recall, f1 = precision_recall_f1(found, true)
 
     def fixed(demos: list[Demo], length: int) -> float:
         cuts = [np.arange(length, len(d), length) for d in demos]

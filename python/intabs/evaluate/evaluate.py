@@ -25,20 +25,21 @@ FIGURES = ("all", "balanced", "joints", "position", "orientation")
 
 def load_learned(source: Path) -> Learned:
     """A run of `intabs train` or a folder of weights."""
+    from intabs.train.cutting import load_cutter
     from intabs.train.trainer import load_model
 
     if (source / "checkpoint.pt").exists():
         model, about = load_model(source)
-        sha256 = about["data"]["sha256"]
+        cutter = load_cutter(model, about.get("cutter"))
     elif (source / "manifest.json").exists():
         from intabs.train.export import load_weights
 
         model, manifest = load_weights(source)
-        about, sha256 = manifest["training"], manifest["training"]["data_sha256"]
+        about, cutter = manifest["training"], None
     else:
         raise UserError(f"{source}: neither a run of `intabs train` (checkpoint.pt) nor a folder of weights")
     torch.set_num_threads(1)
-    return Learned(KINDS[model.kind], model, about["config"], sha256)
+    return Learned(KINDS[model.kind], model, about["config"], cutter)
 
 
 def find_sources(sources: list[Path]) -> list[Path]:

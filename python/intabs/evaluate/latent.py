@@ -14,8 +14,7 @@ from intabs.data.demos import Demo, name_list
 from intabs.errors import UserError
 from intabs.evaluate.learned import Learned
 from intabs.evaluate.metrics import sample
-from intabs.model.space import State, state_of
-from intabs.train.boundaries import Boundaries
+from intabs.model.space import State
 
 FRAMES = 5  # of a skill, drawn
 COLOURS = (
@@ -36,12 +35,10 @@ def skills_of(
     method: Learned, train: list[Demo], demos: list[Demo], names: list[str], label_names: list[str]
 ) -> Skills:
     """Cut where the learned boundaries are. train: the demonstrations the boundaries' scales come from."""
-    model = Boundaries(method.model.space, [state_of(d)[0] for d in train], method.config["objective"]["boundaries"])
     out = Skills(np.zeros((0, 16)), [], [], [])
     rows = []
-    for demo, name in zip(demos, names, strict=True):
-        s = sample(demo)
-        cuts = model.cuts(s.state).tolist()
+    for demo, name, found in zip(demos, names, method.cuts(train, demos), strict=True):
+        s, cuts = sample(demo), found.tolist()
         pieces = list(zip(cuts, cuts[1:], strict=False))
         rows.append(method.encode(method.inputs(s), pieces).numpy())
         task = str(demo.attrs.get("task", ""))

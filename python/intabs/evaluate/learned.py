@@ -6,13 +6,25 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from intabs.data.demos import Demo
 from intabs.evaluate.metrics import Motion, Sample, joined, motion_of
 from intabs.model.networks import InteractionAbstractions, encoder_inputs
+from intabs.model.space import state_of
+from intabs.train.cutting import Cuts, Cutter
+from intabs.train.windows import prepare
 
 
 class Learned:
-    def __init__(self, name: str, model: InteractionAbstractions, config: dict | None = None, data_sha256: str = ""):
-        self.name, self.model, self.config, self.data_sha256 = name, model.eval(), config, data_sha256
+    def __init__(
+        self, name: str, model: InteractionAbstractions, config: dict | None = None, cutter: Cutter | None = None
+    ):
+        self.name, self.model, self.config, self.cutter = name, model.eval(), config, cutter
+
+    def cuts(self, train: list[Demo], demos: list[Demo]) -> list[np.ndarray]:
+        """Learned boundaries of demonstrations: ticks at which skills begin, and last T - 1. train: those that the
+        boundaries' scales come from."""
+        cuts = Cuts(self.model, [state_of(d)[0] for d in train], self.config["objective"], self.cutter)
+        return [cuts.of(d.state, d.command) for d in prepare(demos, self.model.space)]
 
     @torch.no_grad()
     def inputs(self, of: Sample) -> tuple[torch.Tensor, torch.Tensor]:

@@ -23,7 +23,7 @@ from intabs.model.networks import InteractionAbstractions, phase, phase_basis
 from intabs.model.space import Space, state_of
 from intabs.rollout import UNSEEN, Setting, run_trial
 from intabs.skills.library import Library, entries
-from intabs.train.boundaries import Boundaries
+from intabs.train.cutting import load_cutter
 from intabs.train.trainer import load_model, load_named
 
 SCHEMA = 1
@@ -152,10 +152,8 @@ def export(
     (out / "manifest.json").write_text(json.dumps(manifest, indent=1))
 
     demos, names = load_named(checkpoint["data"]["path"], "train")
-    boundaries = Boundaries(
-        model.space, [state_of(d)[0] for d in demos], checkpoint["config"]["objective"]["boundaries"]
-    )
-    cuts = [boundaries.cuts(state_of(d)[0]).tolist() for d in demos]
+    config, cutter = checkpoint["config"], load_cutter(model, checkpoint.get("cutter"))
+    cuts = [c.tolist() for c in Learned("intabs", model, config, cutter).cuts(demos, demos)]
     even = [fixed_cuts(len(d), SEGMENT + 1) for d in demos]
     if practice:
         tries = range(practice)

@@ -31,9 +31,13 @@ def action_error(predicted: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     return mean_over(((predicted - target) ** 2).mean(-1), mask)
 
 
+def kl_each(mean: Tensor, log_std: Tensor) -> Tensor:
+    """KL(N(mean, std^2) || N(0, I)) of each skill [nat], summed over z (Kingma & Welling 2014, appendix B)."""
+    return (0.5 * (mean**2 + torch.exp(2 * log_std) - 1) - log_std).sum(-1)
+
+
 def kl_to_standard_normal(mean: Tensor, log_std: Tensor) -> Tensor:
-    """KL(N(mean, std^2) || N(0, I)) summed over z, mean over skills [nat] (Kingma & Welling 2014, appendix B)."""
-    kl = (0.5 * (mean**2 + torch.exp(2 * log_std) - 1) - log_std).sum(-1)
+    kl = kl_each(mean, log_std)
     return mean_over(kl, torch.ones_like(kl))
 
 

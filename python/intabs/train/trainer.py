@@ -23,7 +23,7 @@ from intabs.evaluate.metrics import Scaling, motion_of
 from intabs.model.networks import InteractionAbstractions, encoder_inputs, phase, phase_basis
 from intabs.model.space import Space, State, state_of
 from intabs.replay.replay import RETURN
-from intabs.train.boundaries import Boundaries
+from intabs.train import cutting
 from intabs.train.linear import start_linear
 from intabs.train.objective import (
     RolloutError,
@@ -36,13 +36,14 @@ from intabs.train.objective import (
     pushed,
     termination_error,
 )
-from intabs.train.windows import Demonstration, Windows, WindowSampler, disturbed
+from intabs.train.windows import Windows, WindowSampler, disturbed, prepare
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 CHECKPOINT_EVERY = 500
 VALIDATE_EVERY = 250
 LOST, LOST_M = 1.0, 0.03  # a rollout so far from the demonstration [deviations of the training split; m] is given up
 PUSH_TICKS = 20  # by then a push has faded to a twelfth
+CUTS = 0.1  # weight of what `objective.cuts` adds [nat a tick]
 CHOICE = 0.02  # of eta's loss for the next skill [nat] beside that for the end of the running one [nat a tick]
 
 
@@ -107,16 +108,6 @@ def load_named(path: Path | str, mask: str | None = None) -> tuple[list[Demo], l
         return [f.demo(k) for k in range(len(f))], list(f.names)
 
 
-def prepare(demos: list[Demo], space: Space, names: list[str] | None = None) -> list[Demonstration]:
-    scale = space.command_scale.cpu()
-    out = []
-    for i, demo in enumerate(demos):
-        state, command = state_of(demo)
-        scaled = torch.from_numpy(command) / scale if command is not None else None
-        out.append(Demonstration(state, scaled, names[i] if names else ""))
-    return out
-
-
 def join_others(device: str) -> tuple[int, int, str]:
     """Rank, number of processes, device: as torchrun says in the environment."""
     world = int(os.environ.get("WORLD_SIZE", "1"))
@@ -171,14 +162,11 @@ class Trainer:
         self.scaling = Scaling.fit([motion_of(d.state) for d in recorded])
         o = config["objective"]
         augment = o["augment"]["lite6" if space.arm is not None else "other"]
-        self.boundaries = Boundaries(space, [d.state for d in recorded], o["boundaries"])
-        cuts = {d.source: self.boundaries.cuts(d.state) for d in recorded}  # a replay has those of its recording
         train = recorded + prepare(replayed, space, [str(d.attrs["source"]) for d in replayed])
         window, segment = o["window"], tuple(o["segment"])
         shown = {"strangers": o["strangers"], "siblings": o["siblings"]}
         self.sampler = WindowSampler(train, space, window, segment, augment, **shown)
-        every = [cuts[d.source] for d in train]
-        self.joint_sampler = WindowSampler(train, space, window, segment, augment, every, **shown)
+        self.joint_sampler = WindowSampler(train, space, window, segment, augment, **shown)
         valid = prepare(valid_demos, space)
         self.valid = WindowSampler(valid, space, window, segment) if valid else None
         self.model = InteractionAbstractions(config["model"], space)
@@ -186,8 +174,14 @@ class Trainer:
         start_linear(self.model, self.sampler, self.rollout_error, o["rollout"], seed)
         self.model.to(device)
         self.rollout_error.to(device)
+        self.cutter = cutting.Cutter(self.model).to(device) if o["cuts"] in cutting.DRAWN else None
+        self.cuts = cutting.Cuts(self.model, [d.state for d in recorded], o, self.cutter)
+        self.recorded = recorded
+        self.found: dict[str, list[int]] = {}  # where the recordings' skills begin
+        if self.cuts.kind == "motion":
+            self._recut()
         t = config["train"]
-        self.optimizer = torch.optim.AdamW(self.model.parameters(), lr=t["lr"], weight_decay=t["weight_decay"])
+        self.optimizer = torch.optim.AdamW(self._parameters(), lr=t["lr"], weight_decay=t["weight_decay"])
         self.scheduler = torch.optim.lr_scheduler.LambdaLR(self.optimizer, self._rate)
         self.rng = np.random.default_rng(seed)
         self.step = 0
@@ -201,6 +195,18 @@ class Trainer:
             return (step + 1) / t["warmup"]
         x = (step - t["warmup"]) / max(1, t["steps"] - t["warmup"])
         return 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * min(x, 1.0)))
+
+    def _parameters(self) -> list[torch.nn.Parameter]:
+        return [*self.model.parameters(), *(self.cutter.parameters() if self.cutter else [])]
+
+    def _recut(self) -> None:
+        """What is found for a recording holds for its replays."""
+        self.found = {d.source: self.cuts.of(d.state, d.command).tolist() for d in self.recorded}
+        self._use_cuts()
+
+    def _use_cuts(self) -> None:
+        if self.found:
+            self.joint_sampler.cuts = [np.array(self.found[d.source]) for d in self.joint_sampler.demonstrations]
 
     def _encode(self, batch: Windows) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and log of the standard deviation of z (M, 16) of what the batch shows."""
@@ -269,6 +275,7 @@ class Trainer:
             terms["near"] = near_error(rolled, want, space.arm, batch.mask)
         if joint:
             terms.update(self._eta_terms(batch, state, z, mean, log_std))
+            terms.update(self._cut_terms(batch, mean, of_windows))
         loss = (
             terms.get("agent", 0.0)
             + o["recall"] * terms.get("recall", 0.0)
@@ -276,6 +283,7 @@ class Trainer:
             + o["motion"] * sum(terms.get(k, 0.0) for k in ("environment", "response", "held"))
             + sum(w * g for w, g in zip(o["rollout"], groups, strict=True))
             + o["beta"] * (terms["kl"] + terms.get("kl_eta", 0.0))
+            + CUTS * (terms.get("cuts", 0.0) + terms.get("prior", 0.0))
             + o["eta"] * (terms.get("termination", 0.0) + CHOICE * terms.get("choice", 0.0))
         )
         return loss, {k: v.detach() for k, v in terms.items()}
@@ -316,6 +324,31 @@ class Trainer:
         terms["kl_eta"] = mean_over(kl_between(*q, *(x.detach() for x in prior)), one)  # trains the encoders
         return terms
 
+    def _cut_terms(self, batch: Windows, z: torch.Tensor, chance) -> dict:
+        """What the kind of cuts adds to a joint batch [nat a tick]."""
+        segment = self.cuts.segment
+        if self.cuts.kind == "exact":
+            return {"cuts": cutting.exact_error(self.model, batch, segment)}
+        if self.cutter is None:
+            return {}
+        told, z = cutting.Told(self.model, batch), z.detach()
+        logit = self.cutter(torch.cat(told.inputs, -1))
+        if self.cuts.kind == "gumbel":
+            uniform = torch.special.ndtr(torch.from_numpy(chance.standard_normal(tuple(logit.shape)))).to(logit)
+            error = cutting.gumbel_error(told, z, logit, uniform, segment)
+        else:
+            error = cutting.reinforce_error(told, z, logit, segment)
+        free = cutting.choices(cutting.begins_of(batch), batch.mask, segment)
+        return {"cuts": error, "prior": cutting.prior_error(logit, free)}
+
+    def _drawn(self, batch: Windows) -> Windows:
+        """The same windows, cut by the network's draws."""
+        with torch.no_grad():
+            whole = batch.to(self.device)
+            logit = self.cutter.look(self.model, whole).cpu()
+        uniform = torch.from_numpy(self.rng.random(tuple(logit.shape), dtype="f4"))
+        return batch.recut(cutting.draw(logit, batch.mask, self.cuts.segment, uniform))
+
     def validate(self) -> dict:
         """Held-out demonstrations, always the same segments, z at its mean, no noise."""
         if self.valid is None:
@@ -340,9 +373,13 @@ class Trainer:
         late = self.step >= o["joint_from"] * t["steps"]
         joint = late and self.step % 2 == 0
         sampler = self.joint_sampler if joint else self.sampler
+        if joint and self.cuts.kind in ("viterbi", "exact") and (not self.found or self.step % cutting.RECUT == 0):
+            self._recut()
         lead = min(o["lead"], sampler.longest_lead) if late and not joint else 0
         lead = int(self.rng.integers(lead + 1)) if lead else 0
         batch = sampler.sample(t["batch"], self.rng, lead)
+        if joint and self.cutter:
+            batch = self._drawn(batch)
         parts = batch.split(lead) if lead else (None, batch)
         before, ours = (x.share(self.rank, self.world).to(self.device) if x else None for x in parts)
         loss, terms = self._loss(ours, self.rng, joint, before)
@@ -355,7 +392,7 @@ class Trainer:
             raise UserError(
                 f"loss is not finite at step {self.step}, batch of {names}; lower train.lr or look at the data"
             )
-        torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config["train"]["clip"])
+        torch.nn.utils.clip_grad_norm_(self._parameters(), self.config["train"]["clip"])
         self.optimizer.step()
         self.scheduler.step()
         self.step += 1
@@ -363,7 +400,7 @@ class Trainer:
 
     def _average(self, loss: torch.Tensor, terms: dict) -> torch.Tensor:
         """Gradients, loss and terms over all processes, in place but for the loss, which is returned."""
-        grads = [p.grad for p in self.model.parameters() if p.grad is not None]
+        grads = [p.grad for p in self._parameters() if p.grad is not None]
         numbers = torch.stack([loss.detach(), *terms.values()])
         flat = torch.cat([g.flatten() for g in grads] + [numbers])
         distributed.all_reduce(flat)
@@ -443,6 +480,8 @@ class Trainer:
                 "seconds": self.seconds,
                 "best": self.best,
                 "model": self.model.state_dict(),
+                "cutter": self.cutter.state_dict() if self.cutter else None,
+                "cuts": self.found,
                 "optimizer": self.optimizer.state_dict(),
                 "scheduler": self.scheduler.state_dict(),
                 "rng": json.dumps(self.rng.bit_generator.state),
@@ -462,6 +501,10 @@ class Trainer:
         if c["data"]["replays_sha256"] != (file_hash(self.replays) if self.replays else ""):
             raise UserError(f"{self.path}: was trained with other --replays")
         self.model.load_state_dict(c["model"])
+        if self.cutter:
+            self.cutter.load_state_dict(c["cutter"])
+        self.found = c["cuts"]
+        self._use_cuts()
         self.optimizer.load_state_dict(c["optimizer"])
         self.scheduler.load_state_dict(c["scheduler"])
         self.rng.bit_generator.state = json.loads(c["rng"])

@@ -5,15 +5,16 @@ A window is N ticks of one demonstration. Its cuts are drawn anew each time (seg
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from intabs.data.demos import Demo
 from intabs.errors import UserError
 from intabs.model import kinematics
-from intabs.model.space import Space, State
+from intabs.model.space import Space, State, state_of
 
 
 @dataclass
@@ -21,6 +22,16 @@ class Demonstration:
     state: State  # (T, ...)
     command: Tensor | None  # (T - 1, A) a^r in units of its scale; None: the agent's displacement is the command
     source: str = ""  # what it is a replay of, tick by tick; recordings have their own name
+
+
+def prepare(demos: list[Demo], space: Space, names: list[str] | None = None) -> list[Demonstration]:
+    scale = space.command_scale.cpu()
+    out = []
+    for i, demo in enumerate(demos):
+        state, command = state_of(demo)
+        scaled = torch.from_numpy(command) / scale if command is not None else None
+        out.append(Demonstration(state, scaled, names[i] if names else ""))
+    return out
 
 
 @dataclass
@@ -67,6 +78,31 @@ class Windows:
     whole: Tensor  # (M,) 1: its end lies in the window; 0: the window's last, which may go on
     names: list[str] = field(default_factory=list)  # of the windows' demonstrations
     ours: Ours | None = None  # where these stand in a batch that several processes share
+
+    @staticmethod
+    def one(state: State, command: Tensor | None) -> Windows:
+        """A recording of N + 1 ticks as a window of one skill."""
+        state, mask = state[None], torch.ones(1, len(state.agent) - 1)
+        command = command[None] if command is not None else None
+        begins = (torch.arange(mask.shape[1]) == 0).float()[None]
+        return Windows(state, command, state, command, mask, *skills_of(begins, mask))
+
+    def recut(self, begins: Tensor) -> Windows:
+        """The same windows with skills that begin where (B, N) is 1."""
+        names = ("skill", "age", "ticks", "gather", "within", "whole")
+        return replace(self, **dict(zip(names, skills_of(begins, self.mask), strict=True)))
+
+    def first(self, n: int) -> Windows:
+        """The first n windows, each one skill."""
+        names = ("state", "command", "shown", "shown_command", "mask")
+        parts = {k: getattr(self, k)[:n] if getattr(self, k) is not None else None for k in names}
+        begins = torch.zeros_like(parts["mask"])
+        begins[:, 0] = 1
+        return Windows(*parts.values(), *skills_of(begins, parts["mask"]))
+
+    def stretches(self, gather: Tensor, within: Tensor) -> Windows:
+        """Other stretches of the same windows as pieces, which may overlap."""
+        return replace(self, gather=gather, within=within)
 
     def share(self, rank: int, world: int) -> Windows:
         """Every world-th window: the share of one of several processes."""
@@ -122,6 +158,32 @@ class Windows:
         moved = {k: v.to(device) for k, v in parts.items() if isinstance(v, Tensor)}
         states = {k: v.map(lambda x: x.to(device)) for k, v in parts.items() if isinstance(v, State)}
         return Windows(**{**parts, **moved, **states})
+
+
+def skills_of(begins: Tensor, mask: Tensor) -> tuple[Tensor, ...]:
+    """Windows' skill, age, ticks, gather, within, whole for skills that begin where (B, N) is 1, the first at 0."""
+    rows, steps = begins.shape
+    flat = (begins * mask).flatten()
+    begin = torch.nonzero(flat)[:, 0]
+    skill = flat.long().cumsum(0) - 1
+    window = begin // steps
+    end = window * steps + mask.sum(1).long()[window]
+    whole = torch.zeros(len(begin), device=begin.device)
+    if len(begin) > 1:
+        same = window[1:] == window[:-1]
+        whole[:-1] = same.float()
+        end[:-1] = torch.where(same, begin[1:], end[:-1])
+    length = end - begin
+    offset = torch.arange(int(length.max()), device=begin.device)[None]
+    t = torch.arange(rows * steps, device=begin.device)
+    return (
+        skill.view(rows, steps),
+        (t - begin[skill]).float().view(rows, steps),
+        length[skill].float().view(rows, steps),
+        begin[:, None] + torch.minimum(offset, length[:, None] - 1),
+        (offset < length[:, None]).float(),
+        whole,
+    )
 
 
 class WindowSampler:
@@ -210,20 +272,12 @@ class WindowSampler:
         t = start[:, None] + np.arange(steps + 1)[None]
         last = self.count[demo][:, None]
         index = torch.from_numpy(self.first[demo][:, None] + np.minimum(t, last))
-        skill, age, ticks = (np.zeros((n, steps), "i8") for _ in range(3))
-        pieces: list[tuple[int, int]] = []
+        begins = np.zeros((n, steps), "f4")
         for b in range(n):
-            within, at = min(steps, int(last[b, 0] - start[b])), 0
+            within = min(steps, int(last[b, 0] - start[b]))
             lengths = self._cut(int(demo[b]), int(start[b]), lead, low, high, rng)
-            for length in lengths + self._cut(int(demo[b]), int(start[b]) + lead, within - lead, low, high, rng):
-                skill[b, at : at + length] = len(pieces)
-                age[b, at : at + length] = np.arange(length)
-                ticks[b, at : at + length] = length
-                pieces.append((b * steps + at, length))
-                at += length
-            skill[b, at:], age[b, at:], ticks[b, at:] = len(pieces) - 1, np.arange(steps - at) + 1, 1
-        begin, length = np.array(pieces).T
-        offset = np.arange(length.max())[None]
+            lengths += self._cut(int(demo[b]), int(start[b]) + lead, within - lead, low, high, rng)
+            begins[b, np.cumsum([0, *lengths[:-1]])] = 1
         shown = demo.copy()
         for i, d in enumerate(demo):
             if len(self.same[d]) > 1 and rng.random() < self.siblings:
@@ -237,18 +291,14 @@ class WindowSampler:
         if self.strangers:
             self._show_strangers(state, self.used[demo], rng)
             self._show_strangers(seen, self.used[shown], rng)
+        mask = torch.from_numpy((t[:, 1:] <= last).astype("f4"))
         return Windows(
             state,
             self.command[index[:, :-1]] if self.command is not None else None,
             seen,
             self.command[shown_index[:, :-1]] if self.command is not None else None,
-            torch.from_numpy((t[:, 1:] <= last).astype("f4")),
-            torch.from_numpy(skill),
-            torch.from_numpy(age.astype("f4")),
-            torch.from_numpy(ticks.astype("f4")),
-            torch.from_numpy(begin[:, None] + np.minimum(offset, length[:, None] - 1)),
-            torch.from_numpy((offset < length[:, None]).astype("f4")),
-            torch.from_numpy(np.append(begin[1:] // steps == begin[:-1] // steps, False).astype("f4")),
+            mask,
+            *skills_of(torch.from_numpy(begins), mask),
             [self.demonstrations[d].source or f"demonstration {d}" for d in demo],
         )
 
