@@ -64,6 +64,28 @@ def test_an_error_of_known_size_is_measured_as_that():
     assert e["all"] == pytest.approx(np.hypot(0.25, 0.5))
 
 
+def test_an_object_that_keeps_its_place_in_the_gripper_has_no_error_seen_from_there():
+    from intabs import _core
+    from intabs.evaluate.metrics import seen_from_tip
+    from intabs.model.kinematics import Arm
+
+    arm, rng = Arm(_core.ArmModel.lite6()), np.random.default_rng(0)
+
+    def carried(q: np.ndarray) -> Motion:
+        p, R = (x.numpy().astype("f8") for x in arm.tip(torch.from_numpy(q.astype("f4"))))
+        agent = np.concatenate([q, np.ones((len(q), 1))], 1)
+        return Motion(agent, p[:, None] + R[:, None] @ [0.0, 0.01, 0.02], R[:, None], np.zeros((len(q), 0)),
+                      np.ones((len(q), 1), bool))  # fmt: skip
+
+    q = np.array([0.0, 0.3, 1.0, 0.0, 0.7, 0.0]) + 0.2 * rng.normal(size=(20, 6)).cumsum(0) / 10
+    one, other = carried(q), carried(q + 0.1)
+    scaling = Scaling.fit([one])
+    assert errors(other, one, scaling)["position"] > 0.1
+    a, b = seen_from_tip(one, arm), seen_from_tip(other, arm)
+    assert np.allclose(a.p, [0.0, 0.01, 0.02], atol=1e-6) and np.allclose(a.R, np.eye(3), atol=1e-6)
+    assert np.allclose(a.p, b.p, atol=1e-6)
+
+
 def test_poses_that_nobody_vouched_for_do_not_count(train):
     m = motion(30)
     m.valid[10:] = False

@@ -35,7 +35,7 @@ def register(app: typer.Typer) -> None:
             import torch  # noqa: F401
         except ImportError:
             raise UserError("torch is not installed: run tools/setup (without --runtime-only)") from None
-        from intabs.evaluate.evaluate import FIGURES
+        from intabs.evaluate.evaluate import FIGURES, FROM_TIP
         from intabs.evaluate.evaluate import evaluate as run
 
         names = [m.strip() for m in methods.split(",") if m.strip()]
@@ -47,6 +47,11 @@ def register(app: typer.Typer) -> None:
         for name, f in figures["methods"].items():
             sd = f"   sd {f['sd']:.4f}" if f["sd"] else ""
             print(f"{name:14}" + "".join(f"{f[k]:13.4f}" for k in FIGURES) + f"   n {f['n']}{sd}")
+        if all(k in f for f in figures["methods"].values() for k in FROM_TIP):
+            print("objects seen from the gripper")
+            for name, f in figures["methods"].items():
+                shown = ("all_from_tip", None, None, "position_from_tip", "orientation_from_tip")
+                print(f"{name:14}" + "".join(f"{f[k]:13.4f}" if k else " " * 13 for k in shown))
         for name, f in figures["ratios"].items():
             text = "".join(f"  {k} {f[k][0]:.2f} ({f[k][1]:.2f}-{f[k][2]:.2f})" for k in FIGURES)
             print(f"{next(iter(figures['methods']))} / {name}:{text}")

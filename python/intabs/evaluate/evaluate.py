@@ -16,11 +16,12 @@ from intabs.evaluate.boundaries import score_boundaries
 from intabs.evaluate.hdmp import FaithfulHdmp, Hdmp
 from intabs.evaluate.knn import score_neighbours
 from intabs.evaluate.learned import Learned
-from intabs.evaluate.metrics import Scaling, errors, fixed_cuts, sample
+from intabs.evaluate.metrics import Motion, Scaling, errors, fixed_cuts, sample, seen_from_tip
 
 KINDS = {"split": "intabs", "joint": "tvi", "agent": "tvi-agent"}
 METHODS = ("intabs", "tvi", "tvi-agent", "pca", "hdmp", "hdmp-faithful", "still", "mean")
 FIGURES = ("all", "balanced", "joints", "position", "orientation")
+FROM_TIP = ("all_from_tip", "position_from_tip", "orientation_from_tip")  # of the Lite 6, objects seen from its gripper
 
 
 def load_learned(source: Path) -> Learned:
@@ -68,7 +69,8 @@ def evaluate(
     """Several sources of a kind are several seeds of one method; methods None: all that there are.
 
     {methods: {name: {all, balanced, joints, position, orientation, sd, n}}, knn, boundaries, ratios, seeds}: means
-    over held-out demonstrations, or over all their segments; sd over seeds, of `all`. ratios: of the first method's
+    over held-out demonstrations, or over all their segments; sd over seeds, of `all`; for the Lite 6 also FROM_TIP.
+    ratios: of the first method's
     figures to the others', with 95 % intervals (bootstrap over held-out demonstrations, paired).
     """
     unknown = [m for m in methods or () if m not in METHODS]
@@ -84,6 +86,16 @@ def evaluate(
     train = [sample(d).motion for d in train_demos]
     held_out = [sample(d) for d in held_out_demos]
     scaling = Scaling.fit(train)
+    arm = next(iter(learned.values()))[0].model.space.arm
+    from_tip = Scaling.fit([seen_from_tip(m, arm) for m in train]) if arm is not None else None
+
+    def score(got: Motion, want: Motion) -> dict[str, float]:
+        out = errors(got, want, scaling)
+        if from_tip is not None:
+            e = errors(seen_from_tip(got, arm), seen_from_tip(want, arm), from_tip)
+            out |= {k: e[k.removesuffix("_from_tip")] for k in FROM_TIP}
+        return out
+
     pieces = []
     for i, s in enumerate(held_out):
         cuts = fixed_cuts(len(s.motion), segment)
@@ -111,13 +123,13 @@ def evaluate(
         for method in make[name]():
             seed = []
             for _, s, cuts in pieces:
-                seed.append(errors(method.reconstruct(s, cuts), s.motion, scaling))
+                seed.append(score(method.reconstruct(s, cuts), s.motion))
                 done += 1
                 progress(done, name)
             rows[name].append(seed)
     figures = {}
     for name, seeds in rows.items():
-        figures[name] = {k: float(np.mean([r[k] for seed in seeds for r in seed])) for k in FIGURES}
+        figures[name] = {k: float(np.mean([r[k] for seed in seeds for r in seed])) for k in seeds[0][0]}
         means = [np.mean([r["all"] for r in seed]) for seed in seeds]
         figures[name] |= {"sd": float(np.std(means, ddof=1)) if len(means) > 1 else 0.0, "n": len(pieces)}
     out = {

@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from intabs.data.demos import Demo
+from intabs.model.kinematics import Arm
 from intabs.model.space import State, state_of
 
 GROUPS = ("joints", "position", "orientation")
@@ -37,6 +38,13 @@ class Motion:
 def motion_of(s: State) -> Motion:
     parts = [x.detach().cpu().numpy().astype("f8") for x in (s.agent, s.p, s.R, s.environment)]
     return Motion(*parts, s.valid.cpu().numpy() > 0)
+
+
+def seen_from_tip(m: Motion, arm: Arm) -> Motion:
+    """The Lite 6's objects in the frame of its tip, p_GO and R_GO, instead of in W."""
+    p_WG, R_WG = (x.numpy().astype("f8") for x in arm.tip(torch.from_numpy(m.agent[:, :-1].astype("f4"))))
+    R_GW = np.swapaxes(R_WG, -1, -2)[:, None]
+    return Motion(m.agent, (R_GW @ (m.p - p_WG[:, None])[..., None])[..., 0], R_GW @ m.R, m.environment, m.valid)
 
 
 def joined(parts: list[Motion]) -> Motion:

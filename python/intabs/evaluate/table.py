@@ -55,21 +55,26 @@ def rows(name: str, data: Path, runs: Path, seeds: int, settings: list[str], pro
     return {"data": str(data), "about": about(data), **out}
 
 
+def both(f: dict, group: str) -> str:
+    """Of objects in the world, and where it is known seen from the gripper."""
+    return f"{f[group]:.4f}" + (f" ({f[g]:.4f})" if (g := f"{group}_from_tip") in f else "")
+
+
 def text(results: dict) -> str:
     lines = []
     for name, r in results.items():
         seeds = r["segment"]["seeds"]
         lines += [
             f"## {name}: {r['about']}, {seeds} seed{'s' * (seeds > 1)}",
-            "| | segment all | balanced | joints | position | orientation | whole all |",
+            "| | segment all | balanced | joints | position (from the tip) | orientation (from the tip) | whole all |",
             "|---|---|---|---|---|---|---|",
         ]
         for method, f in r["segment"]["methods"].items():
             whole = r["whole"]["methods"][method]
             sd = f" ± {f['sd']:.4f}" if f["sd"] else ""
             lines.append(
-                f"| {method} | {f['all']:.4f}{sd} | {f['balanced']:.4f} | {f['joints']:.4f} | {f['position']:.4f} | "
-                f"{f['orientation']:.4f} | {whole['all']:.3f} |"
+                f"| {method} | {f['all']:.4f}{sd} | {f['balanced']:.4f} | {f['joints']:.4f} | {both(f, 'position')} | "
+                f"{both(f, 'orientation')} | {whole['all']:.3f} |"
             )
         for other, k in r["segment"]["ratios"].items():
             said = ", ".join(
