@@ -492,6 +492,31 @@ def test_exported_weights_give_the_same_numbers_in_cpp(data, tmp_path):
     assert verify(out) > 5e-4
 
 
+def test_layer_norm_runs_in_cpp_as_in_torch(data, tmp_path):
+    pytest.importorskip("safetensors")
+    from intabs.train.export import export
+
+    norms = [f"model.{net}.layer_norm=true" for net in ("pi", "encoder", "eta")]
+    trainer = train(data, tmp_path / "run", stop_at=3, extra=norms)
+    assert sum(isinstance(m, torch.nn.LayerNorm) for m in trainer.model.modules()) == 3
+    assert export(tmp_path / "run", tmp_path / "weights", trials=0)["max_abs_error"] < 1e-5
+
+
+@pytest.mark.parametrize(("objects", "numbers"), [("world", 10), ("both", 23)])
+def test_objects_may_be_seen_in_the_world_but_not_exported_so(data, tmp_path, objects, numbers):
+    from intabs.train.export import export
+
+    trainer = train(data, tmp_path / "run", stop_at=2, extra=[f"model.objects={objects}"])
+    space = trainer.model.space
+    assert space.state_dim == 7 + 4 * numbers
+    s = trainer.recorded[0].state
+    raw = space.raw(s)[0][:, 7:].unflatten(-1, (4, numbers))
+    assert torch.equal(raw[..., -10:-7], s.p * s.known[..., None])
+    assert torch.equal(load_model(tmp_path / "run")[0].space.mean, space.mean)
+    with pytest.raises(UserError, match="model.objects=gripper"):
+        export(tmp_path / "run", tmp_path / "weights", trials=0)
+
+
 def test_exported_weights_come_back_as_the_same_model(data, tmp_path):
     pytest.importorskip("safetensors")
     from intabs.train.export import export, load_weights

@@ -18,6 +18,7 @@ class Recurrent(nn.Module):
     """Linear input layer, stacked LSTM with optional residual connections, named linear heads.
 
     Residual: layer l >= 1 hands on h_l + x_l; its own recurrent state stays h_l.
+    Layer norm: layer l >= 1 reads norm(x_l); the residual path goes past it.
     Skip: heads see [top layer, network's input], a linear path beside the LSTMs.
     Bidirectional: heads give one value a sequence: of [forward half at the last tick, backward half at the first] of
     the top layer, or with pool "mean" their mean over the ticks.
@@ -31,6 +32,7 @@ class Recurrent(nn.Module):
         heads: dict[str, int],
         input_linear: int = 0,
         residual: bool = False,
+        layer_norm: bool = False,
         bidirectional: bool = False,
         skip: bool = False,
         pool: str = "last",
@@ -42,6 +44,7 @@ class Recurrent(nn.Module):
             "layers": layers,
             "hidden": hidden,
             "residual": residual,
+            "layer_norm": layer_norm,
             "bidirectional": bidirectional,
             "skip": skip,
             "pool": pool,
@@ -57,6 +60,7 @@ class Recurrent(nn.Module):
             nn.LSTM(first if i == 0 else width, hidden, batch_first=True, bidirectional=bidirectional)
             for i in range(layers)
         )
+        self.norm = nn.ModuleList(nn.LayerNorm(width) if layer_norm and i > 0 else nn.Identity() for i in range(layers))
         read = width + (inputs if skip else 0)
         self.heads = nn.ModuleDict({k: nn.Linear(read, n) for k, n in heads.items()})
         for head in self.heads.values():
@@ -76,7 +80,8 @@ class Recurrent(nn.Module):
         mask (B, T): 1 within a sequence, 0 after its end; None: all are T long."""
         seen, x = x, self.input(x)
         for i, lstm in enumerate(self.lstm):
-            h = self._both_ways(lstm, x, mask) if self.bidirectional and mask is not None else lstm(x)[0]
+            normed = self.norm[i](x)
+            h = self._both_ways(lstm, normed, mask) if self.bidirectional and mask is not None else lstm(normed)[0]
             x = h + x if self.residual and i > 0 else h
         if self.bidirectional and self.pool == "last":
             hidden = self.spec["hidden"]
@@ -110,7 +115,7 @@ class Recurrent(nn.Module):
         for i, lstm in enumerate(self.lstm):
             weights = (lstm.weight_ih_l0, lstm.weight_hh_l0, lstm.bias_ih_l0, lstm.bias_hh_l0)
             before = memory[i] if memory else (x.new_zeros(len(x), lstm.hidden_size),) * 2
-            h, c = torch.lstm_cell(x, before, *weights)
+            h, c = torch.lstm_cell(self.norm[i](x), before, *weights)
             carried.append((h, c))
             x = h + x if self.residual and i > 0 else h
         if self.skip:
@@ -126,6 +131,8 @@ class Recurrent(nn.Module):
             for suffix in ("", "_reverse") if self.bidirectional else ("",):
                 for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
                     out[f"lstm.{i}.{name}{suffix}"] = getattr(lstm, f"{name}_l0{suffix}")
+            if isinstance(self.norm[i], nn.LayerNorm):
+                out[f"lstm.{i}.norm.weight"], out[f"lstm.{i}.norm.bias"] = self.norm[i].weight, self.norm[i].bias
         for name, head in self.heads.items():
             out[f"heads.{name}.weight"], out[f"heads.{name}.bias"] = head.weight, head.bias
         return {k: v.detach().contiguous() for k, v in out.items()}

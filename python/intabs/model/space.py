@@ -12,12 +12,14 @@ import torch
 from torch import Tensor, nn
 
 from intabs.data.demos import OBJECT_SLOTS, Demo
+from intabs.errors import UserError
 from intabs.model import kinematics
 
 SQUASH = 8.0  # predicted changes saturate at so many of their training deviations
 LIMIT = 5.0  # normalised features are clamped there
 Tip = tuple[Tensor, Tensor]  # p_WG (..., 3), R_WG (..., 3, 3)
-LAYOUTS = {"gripper-relative/2": 13, "world/1": 10}  # numbers an object
+LAYOUTS = {"gripper-relative/2": 13, "world/1": 10, "both/1": 23}  # numbers an object
+OBJECTS = {"gripper": "gripper-relative/2", "world": "world/1", "both": "both/1"}  # how the Lite 6's are seen
 
 
 @dataclass
@@ -71,13 +73,16 @@ def state_of(demo: Demo) -> tuple[State, np.ndarray | None]:
 
 
 class Space(nn.Module):
-    """Sizes, scales of the training split, features. arm: intabs._core.ArmModel for the Lite 6, None otherwise."""
+    """Sizes, scales of the training split, features. arm: intabs._core.ArmModel for the Lite 6, None otherwise.
+    objects: one of OBJECTS, for the Lite 6; its runtime knows "gripper" alone."""
 
-    def __init__(self, agent: int, slots: int, environment: int, arm=None):
+    def __init__(self, agent: int, slots: int, environment: int, arm=None, objects: str = "gripper"):
         super().__init__()
         self.agent, self.slots, self.environment = agent, slots, environment
         self.arm = kinematics.Arm(arm) if arm is not None else None
-        self.layout = "gripper-relative/2" if arm is not None else "world/1"
+        if objects not in OBJECTS:
+            raise UserError(f"model.objects is {objects!r}: write one of {', '.join(OBJECTS)}")
+        self.objects, self.layout = objects, OBJECTS[objects if arm is not None else "world"]
         self.joints = agent - 1 if arm is not None else agent  # what moves by steps; the gripper is set
         self.environment_dim = slots * LAYOUTS[self.layout] + environment
         self.change_dim = 6 * slots + environment  # of a^e
@@ -97,12 +102,14 @@ class Space(nn.Module):
     @property
     def config(self) -> dict:
         return {
-            "agent": self.agent, "slots": self.slots, "environment": self.environment, "lite6": self.arm is not None
+            "agent": self.agent, "slots": self.slots, "environment": self.environment, "lite6": self.arm is not None,
+            "objects": self.objects,
         }  # fmt: skip
 
     @staticmethod
     def from_config(config: dict, arm) -> Space:
-        return Space(config["agent"], config["slots"], config["environment"], arm if config["lite6"] else None)
+        arm = arm if config["lite6"] else None
+        return Space(config["agent"], config["slots"], config["environment"], arm, config.get("objects", "gripper"))
 
     def fit(self, demos: list[tuple[State, np.ndarray | None]]) -> None:
         """Scales from the training split."""
@@ -147,13 +154,15 @@ class Space(nn.Module):
     # --- features -----------------------------------------------------------------------------------------------------
     def raw(self, s: State) -> tuple[Tensor, Tip | None]:
         """(..., state_dim) [s^r, s^e] not normalised, and the tip's pose (None without an arm)."""
+        tip, parts = None, []
         if self.arm is not None:
             q, gripper = s.agent[..., :-1], s.agent[..., -1]
-            raw, tip = kinematics.state_features(self.arm, q, gripper, s.p, s.R, s.known, s.valid)
-            return torch.cat([raw, s.environment], -1), tip
-        columns = torch.cat([s.R[..., 0], s.R[..., 1]], -1)
-        objects = torch.cat([s.p, columns, s.valid[..., None]], -1) * s.known[..., None]
-        return torch.cat([s.agent, objects.flatten(-2), s.environment], -1), None
+            features, tip = kinematics.state_features(self.arm, q, gripper, s.p, s.R, s.known, s.valid)
+            parts = [features[..., self.agent :].unflatten(-1, (self.slots, -1))] * (self.objects != "world")
+        if self.layout != "gripper-relative/2":
+            columns = torch.cat([s.R[..., 0], s.R[..., 1]], -1)
+            parts.append(torch.cat([s.p, columns, s.valid[..., None]], -1) * s.known[..., None])
+        return torch.cat([s.agent, torch.cat(parts, -1).flatten(-2), s.environment], -1), tip
 
     def features(self, s: State) -> tuple[Tensor, Tip | None]:
         """raw, normalised."""

@@ -110,6 +110,10 @@ def export(
     model, checkpoint = load_model(run)
     if model.space.arm is None:
         raise UserError(f"{run}: was not trained on the Lite 6; only its weights run in C++")
+    if model.space.layout != _core.STATE_LAYOUT:
+        raise UserError(
+            f"{run}: sees objects as {model.space.layout}; C++ knows {_core.STATE_LAYOUT} (model.objects=gripper)"
+        )
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     tensors = {

@@ -96,11 +96,11 @@ def file_hash(path: Path | str) -> str:
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
-def load_space(demos: list[Demo]) -> Space:
+def load_space(demos: list[Demo], objects: str = "gripper") -> Space:
     """Sizes as in these demonstrations; scales not yet fitted."""
     state, command = state_of(demos[0])
     arm = _core.ArmModel.lite6() if command is not None else None
-    return Space(state.agent.shape[-1], state.p.shape[-2], state.environment.shape[-1], arm)
+    return Space(state.agent.shape[-1], state.p.shape[-2], state.environment.shape[-1], arm, objects)
 
 
 def load_named(path: Path | str, mask: str | None = None) -> tuple[list[Demo], list[str]]:
@@ -156,7 +156,7 @@ class Trainer:
         replayed = [d for d in replayed if d.attrs.get("source") in train_names]
         if self.replays and not replayed:
             raise UserError(f"{replays}: holds no replays of the demonstrations that {data} trains on")
-        space = load_space(train_demos)
+        space = load_space(train_demos, config["model"]["objects"])
         space.fit([state_of(d) for d in train_demos + replayed])
         recorded = prepare(train_demos, space, train_names)
         self.scaling = Scaling.fit([motion_of(d.state) for d in recorded])
