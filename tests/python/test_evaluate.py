@@ -232,6 +232,27 @@ def test_neighbours_vote_and_the_nearer_decides_a_tie():
     assert confusion(np.array([0, 1, 1]), np.array([0, 1, 0]), 2).tolist() == [[1, 0], [1, 1]]
 
 
+def test_pieces_of_compositions_are_right_where_one_of_their_tasks_is_voted_for():
+    from types import SimpleNamespace
+
+    from intabs.evaluate.knn import score_compositions
+
+    def demo(task: str, value: list[float]):
+        """Two pieces of ten ticks each, which the code tells by their value."""
+        return SimpleNamespace(attrs={"task": task}, extra={"labels": np.repeat([0, 1], 10)}, value=value)
+
+    class ByValue:
+        def of(self, demos, pieces):
+            z = np.array([[v, 0.1 * k] for d in demos for v in d.value for k in (1,)]) + 0.0
+            z[:, 1] += np.arange(len(z)) * 1e-3
+            return {name: [z] for name in ("z", "untrained", "pca")}
+
+    train = [demo(t, [v, v]) for t, v in (("a", 0.0), ("b", 5.0), ("c", 9.0)) for _ in range(5)]
+    got = score_compositions(ByValue(), train, [demo("a+b", [0.1, 5.1]), demo("b+c", [0.1, 9.0]), demo("a", [0, 0])])
+    assert got["accuracy"] == 0.75 and got["n"] == 4 and abs(got["chance"] - 2 / 3) < 1e-9
+    assert score_compositions(ByValue(), train, [demo("a", [0, 0])]) is None
+
+
 def test_a_boundary_counts_once_and_within_three_frames():
     from intabs.evaluate.boundaries import precision_recall_f1
 

@@ -67,3 +67,9 @@ def register(app: typer.Typer) -> None:
                 f"boundaries: precision {b['precision']:.3f}, recall {b['recall']:.3f}, F1 {b['f1']:.3f}; "
                 f"best fixed cut {b['fixed_cut_f1']:.3f}, mean training times {b['mean_time_f1']:.3f}"
             )
+        if "compositions" in figures:
+            c = figures["compositions"]
+            print(
+                f"pieces of compositions, 5-NN among single tasks: {c['accuracy']:.3f} of {c['n']} vote for one of "
+                f"theirs; chance {c['chance']:.3f}, untrained encoder {c['untrained']:.3f}, PCA-16 {c['pca']:.3f}"
+            )

@@ -14,7 +14,7 @@ from intabs.errors import UserError
 from intabs.evaluate.baselines import Mean, Pca, Still
 from intabs.evaluate.boundaries import score_boundaries
 from intabs.evaluate.hdmp import FaithfulHdmp, Hdmp
-from intabs.evaluate.knn import score_neighbours
+from intabs.evaluate.knn import Codes, score_compositions, score_neighbours
 from intabs.evaluate.learned import Learned
 from intabs.evaluate.metrics import Motion, Scaling, errors, fixed_cuts, sample, seen_from_tip
 
@@ -141,8 +141,10 @@ def evaluate(
     }
     main = learned.get("intabs") or next(iter(learned.values()))
     if all("labels" in d.extra for d in train_demos + held_out_demos):
-        pca = Pca(train, scaling, segment)
-        out["knn"] = score_neighbours(main, pca, train_demos, held_out_demos)
+        codes = Codes(main, Pca(train, scaling, segment))
+        out["knn"] = score_neighbours(codes, train_demos, held_out_demos)
+        if compositions := score_compositions(codes, train_demos, held_out_demos):
+            out["compositions"] = compositions
         out["boundaries"] = score_boundaries(main[0], train_demos, held_out_demos)
     return out
 

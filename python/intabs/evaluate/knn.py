@@ -45,50 +45,75 @@ def confusion(true: np.ndarray, predicted: np.ndarray, classes: int) -> np.ndarr
     return table
 
 
-def score_neighbours(seeds: list[Learned], pca: Pca, train: list[Demo], held_out: list[Demo], rounds: int = 50) -> dict:
-    """All held-out pieces against all of the training split; and the thesis' protocol: 150 base and 50 query pieces,
-    drawn `rounds` times. `untrained`: the same encoders with random weights; `pca`: 16 principal components of the raw
-    piece."""
-    import torch
+class Codes:
+    """What each method says of pieces: z of every seed, of the same encoders with random weights, and 16 principal
+    components of the raw pieces."""
 
-    from intabs.model.networks import InteractionAbstractions
+    def __init__(self, seeds: list[Learned], pca: Pca):
+        import torch
 
-    untrained = []
-    for k, method in enumerate(seeds):
-        torch.manual_seed(k)
-        model = InteractionAbstractions(method.config["model"], method.model.space)
-        untrained.append(Learned("untrained", model))
-    sides = []
-    for demos in (train, held_out):
-        samples = [sample(d) for d in demos]
-        pieces = [label_pieces(d.extra["labels"]) for d in demos]
-        codes = {
+        from intabs.model.networks import InteractionAbstractions
+
+        self.pca, self.encoders = pca, {"z": seeds, "untrained": []}
+        for k, method in enumerate(seeds):
+            torch.manual_seed(k)
+            model = InteractionAbstractions(method.config["model"], method.model.space)
+            self.encoders["untrained"].append(Learned("untrained", model))
+
+    def of(self, demos: list[Demo], pieces: list[list[tuple[int, int, int]]]) -> dict[str, list[np.ndarray]]:
+        """Name -> for each seed (n, 16)."""
+        sides = [(sample(d), p) for d, p in zip(demos, pieces, strict=True) if p]
+        out = {
             name: [
-                np.concatenate(
-                    [
-                        m.encode(m.inputs(s), [(a, b) for a, b, _ in p]).numpy()
-                        for s, p in zip(samples, pieces, strict=True)
-                        if p
-                    ]
-                )
+                np.concatenate([m.encode(m.inputs(s), [(a, b) for a, b, _ in p]).numpy() for s, p in sides])
                 for m in methods
             ]
-            for name, methods in (("z", seeds), ("untrained", untrained))
+            for name, methods in self.encoders.items()
         }
-        codes["pca"] = [
-            np.stack([pca.encode(s.motion[a : b + 1]) for s, p in zip(samples, pieces, strict=True) for a, b, _ in p])
-        ]
-        sides.append((codes, np.array([label for p in pieces for _, _, label in p])))
+        out["pca"] = [np.stack([self.pca.encode(s.motion[a : b + 1]) for s, p in sides for a, b, _ in p])]
+        return out
+
+
+def predicted(base: list[np.ndarray], labels: np.ndarray, query: list[np.ndarray]) -> list[np.ndarray]:
+    """For each seed; numbers in deviations of the base."""
+    return [neighbours(b / b.std(0), labels, q / b.std(0)) for b, q in zip(base, query, strict=True)]
+
+
+def score_compositions(codes: Codes, train: list[Demo], held_out: list[Demo]) -> dict | None:
+    """Held-out demonstrations of tasks T1+T2: is the task that the pieces of single tasks vote for one of the two?
+    chance: the share of pieces of these two. None without such demonstrations."""
+
+    def taken(demos: list[Demo], joined: bool) -> tuple[list[Demo], list, np.ndarray]:
+        some = [d for d in demos if ("+" in str(d.attrs.get("task", ""))) == joined and "task" in d.attrs]
+        pieces = [label_pieces(d.extra["labels"]) for d in some]
+        return some, pieces, np.array([str(d.attrs["task"]) for d, p in zip(some, pieces, strict=True) for _ in p])
+
+    base, base_pieces, of = taken(train, False)
+    query, query_pieces, wanted = taken(held_out, True)
+    if not len(of) or not len(wanted):
+        return None
+    tasks, labels = np.unique(of, return_inverse=True)
+    right = np.array([[t in w.split("+") for t in tasks] for w in wanted])
+    known, asked = codes.of(base, base_pieces), codes.of(query, query_pieces)
+    out = {
+        name: float(np.mean([right[np.arange(len(p)), p].mean() for p in predicted(known[name], labels, asked[name])]))
+        for name in known
+    }
+    chance = float((right @ np.bincount(labels) / len(labels)).mean())
+    return {"accuracy": out["z"], "untrained": out["untrained"], "pca": out["pca"], "chance": chance, "n": len(wanted)}
+
+
+def score_neighbours(codes: Codes, train: list[Demo], held_out: list[Demo], rounds: int = 50) -> dict:
+    """All held-out pieces against all of the training split; and the thesis' protocol: 150 base and 50 query pieces,
+    drawn `rounds` times."""
+    sides = []
+    for demos in (train, held_out):
+        pieces = [label_pieces(d.extra["labels"]) for d in demos]
+        sides.append((codes.of(demos, pieces), np.array([label for p in pieces for _, _, label in p])))
     (base, base_labels), (query, query_labels) = sides
     majority = np.bincount(base_labels).argmax()
-
-    def accuracy(name: str) -> tuple[float, np.ndarray]:
-        predicted = [
-            neighbours(b / b.std(0), base_labels, q / b.std(0)) for b, q in zip(base[name], query[name], strict=True)
-        ]
-        return float(np.mean([p == query_labels for p in predicted])), predicted[0]
-
-    value, predicted = accuracy("z")
+    found = {name: predicted(base[name], base_labels, query[name]) for name in base}
+    accuracy = {name: float(np.mean([p == query_labels for p in every])) for name, every in found.items()}
     rng = np.random.default_rng(0)
     thesis = []
     for _ in range(rounds):
@@ -96,13 +121,14 @@ def score_neighbours(seeds: list[Learned], pca: Pca, train: list[Demo], held_out
         q = rng.permutation(len(query_labels))[:50]
         x, y = base["z"][0], query["z"][0]
         thesis.append((neighbours(x[b] / x.std(0), base_labels[b], y[q] / x.std(0)) == query_labels[q]).mean())
+    classes = int(max(base_labels.max(), query_labels.max())) + 1
     return {
-        "accuracy": value,
+        "accuracy": accuracy["z"],
         "majority": float((query_labels == majority).mean()),
-        "untrained": accuracy("untrained")[0],
-        "pca": accuracy("pca")[0],
+        "untrained": accuracy["untrained"],
+        "pca": accuracy["pca"],
         "classes": len(np.unique(np.concatenate([base_labels, query_labels]))),
         "n": len(query_labels),
         "thesis_protocol": float(np.mean(thesis)),
-        "confusion": confusion(query_labels, predicted, int(max(base_labels.max(), query_labels.max())) + 1).tolist(),
+        "confusion": confusion(query_labels, found["z"][0], classes).tolist(),
     }

@@ -95,6 +95,12 @@ def text(results: dict) -> str:
                 f"{k['pca']:.3f}); boundaries F1 {b['f1']:.3f} (fixed cut {b['fixed_cut_f1']:.3f}, mean times "
                 f"{b['mean_time_f1']:.3f})"
             )
+        if "compositions" in r["segment"]:
+            c = r["segment"]["compositions"]
+            lines.append(
+                f"- Pieces of compositions, 5-NN among single tasks: {c['accuracy']:.3f} (chance {c['chance']:.3f}, "
+                f"untrained {c['untrained']:.3f}, PCA {c['pca']:.3f})"
+            )
         lines.append("")
     return "\n".join(lines)
 
