@@ -492,6 +492,30 @@ def test_exported_weights_give_the_same_numbers_in_cpp(data, tmp_path):
     assert verify(out) > 5e-4
 
 
+def test_what_fails_while_exporting_leaves_the_weights_that_were_there(data, tmp_path, monkeypatch):
+    pytest.importorskip("safetensors")
+    import shutil
+
+    from intabs.train import export as module
+
+    demos = shutil.copy(data, tmp_path / "demos.hdf5")
+    train(demos, tmp_path / "run", stop_at=2)
+    out = tmp_path / "weights"
+    module.export(tmp_path / "run", out, trials=0)
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    train(demos, tmp_path / "run", stop_at=3)
+    monkeypatch.setattr(module, "verify", lambda out: 1.0)
+    with pytest.raises(UserError, match="differs from torch"):
+        module.export(tmp_path / "run", out, trials=0)
+    assert before == {p.name: p.read_bytes() for p in out.iterdir()} and {p.name for p in tmp_path.iterdir()} == {
+        "demos.hdf5", "run", "weights"
+    }  # fmt: skip
+    with open(demos, "ab") as f:
+        f.write(b" ")
+    with pytest.raises(UserError, match="not the demonstrations"):
+        module.export(tmp_path / "run", out, trials=0)
+
+
 def test_layer_norm_runs_in_cpp_as_in_torch(data, tmp_path):
     pytest.importorskip("safetensors")
     from intabs.train.export import export

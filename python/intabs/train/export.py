@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -24,7 +26,7 @@ from intabs.model.space import Space, state_of
 from intabs.rollout import UNSEEN, Setting, run_trial
 from intabs.skills.library import Library, entries
 from intabs.train.cutting import load_cutter
-from intabs.train.trainer import load_model, load_named
+from intabs.train.trainer import file_hash, load_model, load_named
 
 SCHEMA = 1
 SEGMENT = 14  # ticks of a skill on which the formats are compared
@@ -104,10 +106,13 @@ def export(
 ) -> dict:
     """Returns {sha256, tensors, max_abs_error, formats}. `trials`: closed-loop runs of each weight format;
     `practice`: of each demonstration's skills, for the library to know which do their task; 0: none.
-    Raises UserError if C++ and torch disagree by more than 1e-5."""
-    from safetensors.torch import save_file
-
+    Raises UserError if C++ and torch disagree by more than 1e-5. `out` changes when all is done, not before."""
     model, checkpoint = load_model(run)
+    data = checkpoint["data"]
+    if not Path(data["path"]).exists() or file_hash(data["path"]) != data["sha256"]:
+        raise UserError(
+            f"{data['path']}: not the demonstrations that {run} was trained on; its skills are cut from them"
+        )
     if model.space.arm is None:
         raise UserError(f"{run}: was not trained on the Lite 6; only its weights run in C++")
     if model.space.layout != _core.STATE_LAYOUT:
@@ -115,7 +120,22 @@ def export(
             f"{run}: sees objects as {model.space.layout}; C++ knows {_core.STATE_LAYOUT} (model.objects=gripper)"
         )
     out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(out.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    try:
+        figures = _write(model, checkpoint, partial, trials, practice, jobs, progress)
+        out.mkdir(exist_ok=True)
+        for file in sorted(partial.iterdir()):
+            os.replace(file, out / file.name)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return figures
+
+
+def _write(model: InteractionAbstractions, checkpoint: dict, out: Path, trials, practice, jobs, progress) -> dict:
+    from safetensors.torch import save_file
+
     tensors = {
         f"{net}.{name}": value.float()
         for net, module in model.networks().items()
