@@ -253,6 +253,21 @@ def test_pieces_of_compositions_are_right_where_one_of_their_tasks_is_voted_for(
     assert score_compositions(ByValue(), train, [demo("a", [0, 0])]) is None
 
 
+def test_the_confusion_picture_names_what_was_seen(tmp_path):
+    from matplotlib import pyplot
+
+    from intabs.evaluate.knn import picture
+
+    shown = {}
+    close, pyplot.close = pyplot.close, lambda f: shown.update(rows=[t.get_text() for t in f.axes[0].get_yticklabels()])
+    try:
+        table = [[3, 0, 1], [0, 0, 0], [0, 0, 2]]
+        picture({"confusion": table, "accuracy": 5 / 6, "n": 6}, ["reach", "grasp"], tmp_path / "c.png")
+    finally:
+        pyplot.close = close
+    assert shown["rows"] == ["reach (4)", "2 (2)"] and (tmp_path / "c.png").stat().st_size > 5000
+
+
 def test_a_boundary_counts_once_and_within_three_frames():
     from intabs.evaluate.boundaries import precision_recall_f1
 

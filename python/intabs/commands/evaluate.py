@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from intabs.data.demos import name_list
 from intabs.errors import UserError
 from intabs.output import Progress, write_json
 
@@ -28,6 +29,9 @@ def register(app: typer.Typer) -> None:
             str, typer.Option(help="Comma-separated: intabs, tvi, tvi-agent, pca, hdmp, hdmp-faithful, still, mean.")
         ] = "",
         unit: Annotated[Unit, typer.Option(help="Single segments, or whole demonstrations in a chain.")] = Unit.segment,
+        confusion: Annotated[
+            Path | None, typer.Option(help="Draw there, a .png, which labels 5-NN over z takes for which.")
+        ] = None,
         json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
     ) -> None:
         """Reconstruction error on held-out demonstrations, beside what simpler methods get."""
@@ -38,10 +42,14 @@ def register(app: typer.Typer) -> None:
         from intabs.evaluate.evaluate import FIGURES, FROM_TIP
         from intabs.evaluate.evaluate import evaluate as run
 
+        if confusion and confusion.suffix != ".png":
+            raise UserError(f"--confusion {confusion}: must end in .png")
         names = [m.strip() for m in methods.split(",") if m.strip()]
         with Progress("evaluate", total=0) as progress:
             figures = run(runs, data, names or None, unit.value, progress=progress.update)
         write_json(json, figures)
+        if confusion:
+            draw_confusion(figures, data, confusion)
         print(f"{unit.value}, {figures['seeds']} seed{'s' * (figures['seeds'] > 1)}")
         print(f"{'':14}" + "".join(f"{k:>13}" for k in FIGURES))
         for name, f in figures["methods"].items():
@@ -73,3 +81,15 @@ def register(app: typer.Typer) -> None:
                 f"pieces of compositions, 5-NN among single tasks: {c['accuracy']:.3f} of {c['n']} vote for one of "
                 f"theirs; chance {c['chance']:.3f}, untrained encoder {c['untrained']:.3f}, PCA-16 {c['pca']:.3f}"
             )
+
+
+def draw_confusion(figures: dict, data: Path, out: Path) -> None:
+    from intabs.data.reader import DemoFile
+    from intabs.evaluate.knn import picture
+
+    if "knn" not in figures:
+        raise UserError(f"{data}: has no labels; --confusion needs them")
+    with DemoFile(data) as f:
+        names = name_list(f.attrs.get("label_names"))
+    out.parent.mkdir(parents=True, exist_ok=True)
+    picture(figures["knn"], names, out)

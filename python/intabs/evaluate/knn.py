@@ -5,6 +5,8 @@ A piece is a stretch of one label. Base: the training split; queries: held-out d
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 
 from intabs.data.demos import Demo
@@ -132,3 +134,27 @@ def score_neighbours(codes: Codes, train: list[Demo], held_out: list[Demo], roun
         "thesis_protocol": float(np.mean(thesis)),
         "confusion": confusion(query_labels, found["z"][0], classes).tolist(),
     }
+
+
+def picture(knn: dict, names: list[str], out: Path) -> None:
+    """The confusion matrix, rows: true, in shares of the row."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    table = np.array(knn["confusion"])
+    used = np.flatnonzero(table.sum(0) + table.sum(1))
+    table = table[np.ix_(used, used)]
+    words = [names[k] if k < len(names) else str(k) for k in used]
+    figure, ax = pyplot.subplots(figsize=(2.5 + 0.4 * len(used),) * 2, constrained_layout=True)
+    ax.imshow(table / np.maximum(table.sum(1, keepdims=True), 1), cmap="Blues", vmin=0, vmax=1)
+    for i, j in np.argwhere(table):
+        ax.text(j, i, table[i, j], ha="center", va="center", fontsize=8, color="white" if i == j else "black")
+    ax.set_xticks(range(len(words)), words, rotation=90)
+    ax.set_yticks(range(len(words)), [f"{w} ({n})" for w, n in zip(words, table.sum(1), strict=True)])
+    ax.set_xlabel("5-NN says")
+    ax.set_ylabel("label")
+    ax.set_title(f"{knn['accuracy']:.3f} of {knn['n']} held-out pieces")
+    figure.savefig(out, dpi=120)
+    pyplot.close(figure)
