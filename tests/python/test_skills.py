@@ -194,3 +194,20 @@ def test_a_run_needs_a_scene(made, library):
     z, ticks, index = whole(library, "pick_place", None).arrays()
     with pytest.raises(RuntimeError, match="reset"):
         _core.Rollout(str(paths.MODELS), "pick_place", str(made[0])).run(z, ticks, index)
+
+
+@pytest.mark.parametrize(
+    ("task", "orders"),
+    [("pour+stir", {("pour", "stir")}),
+     ("drawer_open+pick_place", {("drawer_open", "pick_place"), ("pick_place", "drawer_open")})],
+)  # fmt: skip
+def test_what_concerns_one_object_is_done_in_the_order_asked_for(task, orders):
+    from intabs.skills.planner import Planner, goals_of, seen_from
+
+    planner = Planner(paths.MODELS / "weights" / "lite6")
+    session = _core.Session(str(paths.MODELS), task, "")
+    session.reset(3, 2.0)
+    seen = seen_from(session.observe())
+    found = planner.search(goals_of(planner.library, task, seen), seen)
+    pairs = {tuple(e.chain[0].task for e in sequence) for sequence in found if len(sequence) == 2}
+    assert orders <= pairs and (len(orders) == 2 or ("stir", "pour") not in pairs)

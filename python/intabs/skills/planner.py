@@ -108,6 +108,11 @@ def _turns(path: np.ndarray) -> np.ndarray:
     return (rotation(path[0]).inv() * rotation(path)).magnitude()
 
 
+def _nearest(a: np.ndarray, b: np.ndarray) -> float:
+    """Of two paths (F, 3) [m]."""
+    return float(np.linalg.norm(a - b, axis=-1).min())
+
+
 class Effect:
     """What a chain's recording did, object by object, so that it can be carried over to another scene."""
 
@@ -121,8 +126,11 @@ class Effect:
         self.moved = [i for i in range(SLOTS) if self.first.known[i] and far[i] + TURN_LENGTH * turn[i] > MOVES]
         # Where a moved object ended near one that rested, its path is told from there.
         self.brought_to = {}
+        resting = [j for j in range(SLOTS) if self.first.known[j] and j not in self.moved]
+        p = self.path[..., :3]
+        self.concerns = {*self.moved}  # and what they came near
+        self.concerns |= {j for i in self.moved for j in resting if _nearest(p[:, i], p[:, j]) < BROUGHT_WITHIN}
         for i in self.moved:
-            resting = [j for j in range(SLOTS) if self.first.known[j] and j not in self.moved]
             distance = {j: np.linalg.norm(last.object_pose[i, :3] - last.object_pose[j, :3]) for j in resting}
             if distance and min(distance.values()) < BROUGHT_WITHIN and far[i] > MOVES:
                 self.brought_to[i] = min(distance, key=distance.get)
@@ -223,8 +231,13 @@ class Planner:
         for e in effects:
             ranked.append((missing(goals, first[id(e)])[0], _apart(e.chain, seen), [e]))
         if len({g.slot for g in goals}) > 1:
+            named = {g.slot: k for k, g in reversed(list(enumerate(goals)))}  # slot -> its first goal
+            turn = {id(e): min((named[i] for i in e.moved if i in named), default=len(goals)) for e in effects}
             for a, b in product(effects, effects):
                 if set(a.moved) == set(b.moved):
+                    continue
+                # What concerns the same object is done in the order it was asked for: poured, then stirred.
+                if a.concerns & b.concerns and turn[id(a)] > turn[id(b)]:
                     continue
                 path = first[id(a)]
                 more = b.on(path[-1])
