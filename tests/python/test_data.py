@@ -479,6 +479,21 @@ def test_a_split_holds_out_a_share_of_every_task_and_the_same_for_the_same_seed(
     assert find_faults(train) == find_faults(valid) == []
 
 
+def test_pieces_are_all_of_it_and_know_where_they_come_from(sound, tmp_path):
+    out = tmp_path / "pieces.hdf5"
+    assert run(["data", "pieces", str(sound), "--out", str(out), "--frames", "10"]) == 0
+    with DemoFile(sound) as whole, DemoFile(out) as f:
+        assert sum(f.lengths) == sum(whole.lengths) and max(f.lengths) <= 15 and len(f) > 2 * len(whole)
+        for k in range(len(f)):
+            piece = f.demo(k)
+            source = whole.demo(whole.names.index(piece.attrs["source"]))
+            a = int(piece.attrs["source_frame"])
+            assert np.array_equal(piece.actions, source.actions[a : a + len(piece)]) and piece.time[0] == 0
+            assert f.tasks[k] == whole.tasks[whole.names.index(piece.attrs["source"])]
+    assert run(["data", "split", str(out), "--valid", "0.2"]) == 0 and find_faults(out) == []
+    assert run(["data", "pieces", str(sound), "--out", str(sound), "--frames", "10"]) == 1
+
+
 # ---- looking -----------------------------------------------------------------------------------------------------
 
 

@@ -167,6 +167,23 @@ def register(app: typer.Typer) -> None:
         print(", ".join(f"{mask}: {n}" for mask, n in figures.items()))
 
     @data.command()
+    def pieces(
+        file: FileArgument,
+        out: Annotated[Path, typer.Option("--out", "-o", help="File to write.")],
+        frames: Annotated[int, typer.Option(min=4, help="About how long a piece is.")],
+        json: JsonOption = None,
+    ) -> None:
+        """Cut demonstrations into pieces, each a demonstration: to hold out (split) by piece of a handful."""
+        from intabs.data import edit as edits
+
+        if out.resolve() == file.resolve():
+            raise UserError(f"--out {out}: write another file; the whole demonstrations would be lost")
+        with Progress("pieces", total=1) as bar:
+            count = edits.into_pieces(file, out, frames, _counting(bar))
+        write_json(json, {"pieces": count})
+        print(f"{out}: {count} pieces")
+
+    @data.command()
     def edit(
         file: FileArgument,
         out: OutOption = None,

@@ -204,6 +204,25 @@ def hold_out_groups(names: list[str], groups: list[str], share: float, seed: int
     }
 
 
+def into_pieces(path: Path, out: Path, frames: int, progress: Progress = _quiet) -> int:
+    """Every demonstration cut into pieces of about so many frames, each a demonstration that knows its `source`: to
+    hold out by piece where there is but a handful. Returns how many there are."""
+    with DemoFile(path) as f:
+        counts = [max(1, round(n / frames)) for n in f.lengths]
+        attrs = {k: v for k, v in f.attrs.items() if k not in FILE_ONLY}
+        with DemoWriter(out, attrs, packed=sum(counts) > PACKED_ABOVE) as writer:
+            for k, count in enumerate(counts):
+                demo = _own(f, k)
+                edges = np.linspace(0, f.lengths[k], count + 1).round().astype(int)
+                for a, b in zip(edges[:-1], edges[1:], strict=True):
+                    piece = cut(demo, a, b)
+                    piece.attrs = demo.attrs | {"source": f.names[k], "source_frame": int(a)}
+                    writer.add(piece, f"demo_{len(writer.names)}")
+                progress(k + 1, len(counts))
+            writer.masks = {"train": list(writer.names), "valid": []}
+    return sum(counts)
+
+
 def split(
     path: Path, out: Path, share: float, seed: int, apart: bool, by: str = "", progress: Progress = _quiet
 ) -> dict:
