@@ -186,8 +186,12 @@ def test_displacement_is_that_of_the_farthest_object(library):
 
 
 def test_where_practice_cannot_tell_the_best_try_more():
-    chains = [("a", "1"), ("a", "2"), ("a", "3"), ("b", "4"), ("b", "5"), ("c", "6")]
-    assert unsure(chains, [3, 2, 1, 4, 3, 0], 4) == [("a", "1"), ("a", "2")]
+    chains = [*(("a", str(k)) for k in range(3)), *(("b", str(k)) for k in range(3, 7)), ("c", "7"), ("d", "8")]
+    won = [3, 2, 1, 4, 4, 3, 4, 0, 4]
+    assert unsure(chains, won, 4) == [("a", "0"), ("a", "1")]
+    # One that always did it may have been lucky.
+    won[3] = won[4] = 3
+    assert unsure(chains, won, 4) == [("a", "0"), ("a", "1"), ("b", "3"), ("b", "4"), ("b", "5"), ("b", "6")]
 
 
 def test_a_run_needs_a_scene(made, library):

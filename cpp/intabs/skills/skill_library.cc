@@ -27,9 +27,6 @@ Skill ReadSkill(const nlohmann::json& j) {
   Read(j.at("moved"), skill.record.moved.data(), kMaxObjects);
   const nlohmann::json& rested = j.at("rested");
   for (int i = 0; i < kMaxObjects; ++i) skill.record.rested[i] = rested.at(i).get<bool>();
-  const nlohmann::json& places = j.at("p_GO");
-  for (int i = 0; i < kMaxObjects; ++i) Read(places.at(i), skill.record.p_GO[i].data(), 3);
-  skill.record.gripper_closed = j.at("gripper_closed").get<bool>();
   return skill;
 }
 

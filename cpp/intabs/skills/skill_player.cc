@@ -63,45 +63,32 @@ void SkillPlayer::Watch(const Observation& observation) noexcept {
   }
 }
 
-// The slot that did not move as recorded, or -1.
-int SkillPlayer::Missing(const SkillRecord& record, const Observation& observation) const noexcept {
+// Whether an object did not move as recorded.
+bool SkillPlayer::Missing(const SkillRecord& record, const Observation& observation) const noexcept {
   for (int i = 0; i < kMaxObjects; ++i) {
     if (record.moved[i] <= kEffect || before_[i].id < 0 || !before_[i].valid || !observation.objects[i].valid) continue;
-    if (moved_[i] < kEffectShare * record.moved[i]) return i;
+    if (moved_[i] < kEffectShare * record.moved[i]) return true;
   }
-  return -1;
+  return false;
 }
 
-// Of the skills before the object began to move, the one that began with the object as it is now, seen from the tip.
-int SkillPlayer::RetryFrom(int skill, int slot, const Observation& observation) const noexcept {
-  int last = skill;
-  while (last > 0 && !Rested(skills_[last].record)) --last;
-  int first = last;
-  while (first > 0 && Rested(skills_[first - 1].record)) --first;
-  const Pose X_WG = policy_.codec().arm().Tip(observation.q);
-  const Eigen::Vector3f p_GO = (X_WG.Inverse() * observation.objects[slot].X_WO).p.cast<float>();
-  int best = first;
-  float nearest = std::numeric_limits<float>::max();
-  for (int k = first; k <= last; ++k) {
-    const SkillRecord& record = skills_[k].record;
-    if (record.gripper_closed != skills_[first].record.gripper_closed) break;  // the grasp itself comes too late
-    if (const float d = (record.p_GO[slot] - p_GO).norm(); d < nearest) {
-      nearest = d;
-      best = k;
-    }
-  }
-  return best;
+// The first of the skills that led up to the object's motion: pi has learned to begin that one from anywhere, those closer
+// to the grasp only from beside the demonstration.
+int SkillPlayer::RetryFrom(int skill) const noexcept {
+  while (skill > 0 && !Rested(skills_[skill].record)) --skill;
+  while (skill > 0 && Rested(skills_[skill - 1].record)) --skill;
+  return skill;
 }
 
 // The running skill is over.
 void SkillPlayer::GoOn(SkillEnd why, const Observation& observation) noexcept {
-  if (const int slot = Missing(skills_[status_.skill_index].record, observation); slot >= 0) {
+  if (Missing(skills_[status_.skill_index].record, observation)) {
     if (status_.retries == kMaxRetries) {
       status_.end_reason = EndReason::kNoEffect;
       return;
     }
     ++status_.retries;
-    Begin(RetryFrom(status_.skill_index, slot, observation), SkillEnd::kNoEffect, observation);
+    Begin(RetryFrom(status_.skill_index), SkillEnd::kNoEffect, observation);
   } else if (status_.skill_index + 1 == status_.n_skills) {
     status_.end_reason = EndReason::kFinished;
     status_.skill_end = why;

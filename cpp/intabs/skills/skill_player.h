@@ -16,18 +16,13 @@
 
 namespace intabs {
 
-// What the demonstration did in a skill, to notice when it does not happen and to find a place to try again from.
+// What the demonstration did in a skill, to notice when it does not happen and to know where to try again from.
 struct SkillRecord {
   // How far each object had come at most by its end, |dp| + kTurnLength * angle [m], from where it last rested as a skill
   // began; whether it did so as this one began.
   std::array<float, kMaxObjects> moved{};
   std::array<bool, kMaxObjects> rested{};
-  std::array<Eigen::Vector3f, kMaxObjects> p_GO;  // of each object in the tip's frame as the skill began [m]
-  bool gripper_closed = false;                    // as it began
-  SkillRecord() {
-    p_GO.fill(Eigen::Vector3f::Zero());
-    rested.fill(true);
-  }
+  SkillRecord() { rested.fill(true); }
 };
 
 struct Skill {
@@ -111,8 +106,8 @@ class SkillPlayer {
   void Begin(int skill, SkillEnd why, const Observation& observation) noexcept;
   void GoOn(SkillEnd why, const Observation& observation) noexcept;
   void Watch(const Observation& observation) noexcept;
-  int Missing(const SkillRecord& record, const Observation& observation) const noexcept;
-  int RetryFrom(int skill, int slot, const Observation& observation) const noexcept;
+  bool Missing(const SkillRecord& record, const Observation& observation) const noexcept;
+  int RetryFrom(int skill) const noexcept;
 
   Policy policy_;
   Termination termination_;

@@ -149,7 +149,7 @@ def _frame(d: dict) -> Frame:
     return Frame(np.array(d["q"], float), bool(d["gripper_closed"]), pose, known)
 
 
-def entries(task: str, source: str, z: np.ndarray, cuts: list[int], q, gripper, object_pose, known, arm) -> list[dict]:
+def entries(task: str, source: str, z: np.ndarray, cuts: list[int], q, gripper, object_pose, known) -> list[dict]:
     """For the file: the skills of a demonstration, z (n, 16), which begin at cuts[:-1]; the last ends at cuts[-1].
     q (T, 6), gripper (T,), object_pose (T, 4, 7), known (T, 4)."""
     out, rest = [], np.zeros(SLOTS, int)
@@ -161,7 +161,7 @@ def entries(task: str, source: str, z: np.ndarray, cuts: list[int], q, gripper, 
             if rested[slot]:
                 rest[slot] = a
             moved[slot] = _came(object_pose[rest[slot] : b + 1, slot])
-        out.append(_entry(task, source, number, z[number], a, b, moved, rested, q, gripper, object_pose, known, arm))
+        out.append(_entry(task, source, number, z[number], a, b, moved, rested, q, gripper, object_pose, known))
     return out
 
 
@@ -171,12 +171,10 @@ def _came(pose: np.ndarray) -> float:
     return float((np.linalg.norm(pose[:, :3] - pose[0, :3], axis=1) + TURN_LENGTH * (R[0].inv() * R).magnitude()).max())
 
 
-def _entry(task, source, number, z, a, b, moved, rested, q, gripper, object_pose, known, arm) -> dict:
+def _entry(task, source, number, z, a, b, moved, rested, q, gripper, object_pose, known) -> dict:
     """Durations may be a sixth shorter or longer than recorded: with two fifths eta ended skills too early."""
     n = b - a
     shortest = max(1, round(0.85 * n))
-    X_WG = np.asarray(arm.tip(q[a]))
-    places = np.where(known[a, :, None], rotation(X_WG).inv().apply(object_pose[a, :, :3] - X_WG[:3]), 0)
 
     def frame(t: int) -> dict:
         objects = {str(i): [round(float(v), 4) for v in object_pose[t, i]] for i in np.flatnonzero(known[t])}
@@ -184,9 +182,8 @@ def _entry(task, source, number, z, a, b, moved, rested, q, gripper, object_pose
 
     return {
         "task": task, "source": source, "number": number, "ticks": n, "min_ticks": shortest,
-        "max_ticks": 2 * n - shortest, "z": [round(float(v), 5) for v in z], "gripper_closed": bool(gripper[a]),
-        "rested": rested.tolist(),
-        "moved": [round(float(v), 4) for v in moved], "p_GO": [[round(float(v), 4) for v in p] for p in places],
+        "max_ticks": 2 * n - shortest, "z": [round(float(v), 5) for v in z],
+        "rested": rested.tolist(), "moved": [round(float(v), 4) for v in moved],
         "frames": [frame(t) for t in (a, a + n // 2, b)],
     }  # fmt: skip
 

@@ -32,6 +32,7 @@ SCHEMA = 1
 SEGMENT = 14  # ticks of a skill on which the formats are compared
 GOLDEN_TICKS = 40
 PRACTICE_CM, PRACTICE_SEED = 3.0, 500_000
+SURE = 3
 MORE = 4  # times as many tries where it is not clear which demonstration does best
 TOLERANCE = 1e-5
 
@@ -59,14 +60,14 @@ def encode_demo(model: InteractionAbstractions, demo: Demo, cuts: list[int]) -> 
 
 def library_of(model, demos: list[Demo], names: list[str], cuts: list[list[int]]) -> dict:
     """skills.json: every skill of these demonstrations, cut at these ticks (skills/library.py)."""
-    arm, skills = _core.ArmModel.lite6(), []
+    skills = []
     for demo, name, at in zip(demos, names, cuts, strict=True):
         known = np.maximum.accumulate(demo.object_valid.astype(bool), axis=0)
         missing = OBJECT_SLOTS - known.shape[1]
         known = np.pad(known, ((0, 0), (0, missing)))
         pose = np.pad(demo.object_pose, ((0, 0), (0, missing), (0, 0)))
         z, of = encode_demo(model, demo, at), (demo.joint_pos, demo.gripper > 0.5, pose, known)
-        skills += entries(str(demo.attrs["task"]), name, z, at, *of, arm)
+        skills += entries(str(demo.attrs["task"]), name, z, at, *of)
     return {"skills": skills, "practice": []}
 
 
@@ -91,9 +92,14 @@ def practise(
 
 
 def unsure(chains: list[tuple[str, str]], won: list[int], tries: int) -> list[tuple[str, str]]:
-    """Where no demonstration of a task always did it, the best ones: few tries hardly tell them apart."""
-    best = {task: max(w for (t, _), w in zip(chains, won, strict=True) if t == task) for task, _ in chains}
-    return [c for c, w in zip(chains, won, strict=True) if best[c[0]] < tries and w >= max(best[c[0]] - 1, 1)]
+    """Where not even SURE demonstrations of a task always did it, the best ones: few tries hardly tell them apart."""
+    out = []
+    for task in dict.fromkeys(t for t, _ in chains):
+        own = {c: w for c, w in zip(chains, won, strict=True) if c[0] == task}
+        best = max(own.values())
+        if sum(w == tries for w in own.values()) < min(SURE, len(own)):
+            out += [c for c, w in own.items() if w >= max(best - 1, 1)]
+    return out
 
 
 def export(
