@@ -486,10 +486,12 @@ def test_pieces_are_all_of_it_and_know_where_they_come_from(sound, tmp_path):
         assert sum(f.lengths) == sum(whole.lengths) and max(f.lengths) <= 15 and len(f) > 2 * len(whole)
         for k in range(len(f)):
             piece = f.demo(k)
-            source = whole.demo(whole.names.index(piece.attrs["source"]))
-            a = int(piece.attrs["source_frame"])
+            source = whole.demo(whole.names.index(piece.attrs["piece_of"]))
+            a = int(piece.attrs["first_frame"])
             assert np.array_equal(piece.actions, source.actions[a : a + len(piece)]) and piece.time[0] == 0
-            assert f.tasks[k] == whole.tasks[whole.names.index(piece.attrs["source"])]
+            assert f.tasks[k] == whole.tasks[whole.names.index(piece.attrs["piece_of"])]
+    with DemoFile(sound, "valid") as whole, DemoFile(out, "valid") as f:
+        assert sum(f.lengths) == sum(whole.lengths) > 0
     assert run(["data", "split", str(out), "--valid", "0.2"]) == 0 and find_faults(out) == []
     assert run(["data", "pieces", str(sound), "--out", str(sound), "--frames", "10"]) == 1
 

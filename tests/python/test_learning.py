@@ -342,6 +342,13 @@ def test_resuming_gives_the_weights_of_an_unbroken_run(data, tmp_path):
     assert all(torch.equal(whole[k], resumed[k]) for k in whole)
 
 
+def test_a_run_goes_on_only_with_the_cuts_it_began_with(data, tmp_path):
+    train(data, tmp_path / "run", stop_at=2)
+    other = load_config("intabs-small", [*SMALL, "objective.cuts=viterbi"])
+    with pytest.raises(UserError, match="objective.cuts"):
+        Trainer(other, data, tmp_path / "run", 0, "cpu").resume()
+
+
 @pytest.mark.parametrize("kind", ["viterbi", "exact", "gumbel", "reinforce"])
 def test_every_kind_of_cuts_trains_resumes_and_cuts_what_is_held_out(data, tmp_path, kind):
     from intabs.evaluate.evaluate import load_learned
@@ -405,13 +412,18 @@ def test_drawn_cuts_learn_where_the_motion_changes():
             optimizer.zero_grad()
             (error + cutting.prior_error(logit, free)).backward()
             optimizer.step()
-        p = torch.sigmoid(net(torch.tensor([[0.0, 1, 1], [0, 0, 0], [1, 1, 1]])))[:, 0]
-        assert p[0] > 0.3 and p[0] > 3 * p[1:].max(), (kind, p)
+        for at in range(4, 12):
+            x = (torch.arange(steps) >= at).float()
+            seen = torch.stack([x.roll(1), x, x.roll(-1)], -1)
+            seen[0] = seen[1]
+            seen[-1] = seen[-2]
+            assert cutting.likeliest(net(seen)[:, 0].detach(), segment).tolist() == [0, at, steps], (kind, at)
 
 
-def test_two_processes_train_as_one_does(data, tmp_path):
+@pytest.mark.parametrize("kind", ["motion", "exact", "gumbel", "reinforce"])
+def test_two_processes_train_as_one_does(data, tmp_path, kind):
     """Odd batches and windows that end early: shares differ in all their counts."""
-    settings = [*SMALL, "train.batch=7", "objective.joint_from=0.3"]
+    settings = [*SMALL, "train.batch=7", "objective.joint_from=0.3", f"objective.cuts={kind}"]
     alone = Trainer(load_config("intabs-small", settings), data, tmp_path / "alone", 0, "cpu")
     result = alone.train()
     command = ["train", "--config", "intabs-small", "--data", str(data), "--out", str(tmp_path / "both")]
@@ -563,7 +575,7 @@ def test_a_map_shows_every_skill_as_picture_and_as_page(data, tmp_path):
     trainer = train(data, tmp_path / "run", steps=2)
     figures = latent(tmp_path / "run", data, tmp_path / "map.png")
     assert Image.open(tmp_path / "map.png").size[0] > 500
-    skills = sum(len(trainer.boundaries.cuts(state_of(d)[0])) - 1 for d in load_demos(data)[0])
+    skills = sum(len(trainer.cuts.of(state_of(d)[0], None)) - 1 for d in load_demos(data)[0])
     assert figures == {"skills": skills, "kinds": 1, "demos": 4}
     latent(tmp_path / "run", data, tmp_path / "map.html")
     page = (tmp_path / "map.html").read_text()

@@ -48,8 +48,6 @@ def register(app: typer.Typer) -> None:
         with Progress("evaluate", total=0) as progress:
             figures = run(runs, data, names or None, unit.value, progress=progress.update)
         write_json(json, figures)
-        if confusion:
-            draw_confusion(figures, data, confusion)
         print(f"{unit.value}, {figures['seeds']} seed{'s' * (figures['seeds'] > 1)}")
         print(f"{'':14}" + "".join(f"{k:>13}" for k in FIGURES))
         for name, f in figures["methods"].items():
@@ -70,7 +68,7 @@ def register(app: typer.Typer) -> None:
                 f"{k['thesis_protocol']:.3f}); majority {k['majority']:.3f}, untrained encoder {k['untrained']:.3f}, "
                 f"PCA-16 {k['pca']:.3f}"
             )
-            b = figures["boundaries"]
+        if b := figures.get("boundaries"):
             print(
                 f"boundaries: precision {b['precision']:.3f}, recall {b['recall']:.3f}, F1 {b['f1']:.3f}; "
                 f"best fixed cut {b['fixed_cut_f1']:.3f}, mean training times {b['mean_time_f1']:.3f}"
@@ -81,6 +79,8 @@ def register(app: typer.Typer) -> None:
                 f"pieces of compositions, 5-NN among single tasks: {c['accuracy']:.3f} of {c['n']} vote for one of "
                 f"theirs; chance {c['chance']:.3f}, untrained encoder {c['untrained']:.3f}, PCA-16 {c['pca']:.3f}"
             )
+        if confusion:
+            draw_confusion(figures, data, confusion)
 
 
 def draw_confusion(figures: dict, data: Path, out: Path) -> None:

@@ -205,8 +205,8 @@ def hold_out_groups(names: list[str], groups: list[str], share: float, seed: int
 
 
 def into_pieces(path: Path, out: Path, frames: int, progress: Progress = _quiet) -> int:
-    """Every demonstration cut into pieces of about so many frames, each a demonstration that knows its `source`: to
-    hold out by piece where there is but a handful. Returns how many there are."""
+    """Every demonstration cut into pieces of about so many frames, each a demonstration that knows what it is a
+    `piece_of`: to hold out by piece where there is but a handful. What was held out stays so. Returns their number."""
     with DemoFile(path) as f:
         counts = [max(1, round(n / frames)) for n in f.lengths]
         attrs = {k: v for k, v in f.attrs.items() if k not in FILE_ONLY}
@@ -216,10 +216,14 @@ def into_pieces(path: Path, out: Path, frames: int, progress: Progress = _quiet)
                 edges = np.linspace(0, f.lengths[k], count + 1).round().astype(int)
                 for a, b in zip(edges[:-1], edges[1:], strict=True):
                     piece = cut(demo, a, b)
-                    piece.attrs = demo.attrs | {"source": f.names[k], "source_frame": int(a)}
+                    piece.attrs = demo.attrs | {"piece_of": f.names[k], "first_frame": int(a)}
                     writer.add(piece, f"demo_{len(writer.names)}")
                 progress(k + 1, len(counts))
-            writer.masks = {"train": list(writer.names), "valid": []}
+            of = np.repeat(f.names, counts)
+            masks = f.masks() or {"train": f.names, "valid": []}
+            writer.masks = {
+                m: [n for n, x in zip(writer.names, of, strict=True) if x in set(names)] for m, names in masks.items()
+            }
     return sum(counts)
 
 

@@ -145,7 +145,8 @@ def evaluate(
         out["knn"] = score_neighbours(codes, train_demos, held_out_demos)
         if compositions := score_compositions(codes, train_demos, held_out_demos):
             out["compositions"] = compositions
-        out["boundaries"] = score_boundaries(main[0], train_demos, held_out_demos)
+        if main[0].cuts_itself:
+            out["boundaries"] = score_boundaries(main[0], train_demos, held_out_demos)
     return out
 
 

@@ -10,7 +10,7 @@ from intabs.data.demos import Demo
 from intabs.evaluate.metrics import Motion, Sample, joined, motion_of
 from intabs.model.networks import InteractionAbstractions, encoder_inputs
 from intabs.model.space import state_of
-from intabs.train.cutting import Cuts, Cutter
+from intabs.train.cutting import DRAWN, Cuts, Cutter
 from intabs.train.windows import prepare
 
 
@@ -19,6 +19,11 @@ class Learned:
         self, name: str, model: InteractionAbstractions, config: dict | None = None, cutter: Cutter | None = None
     ):
         self.name, self.model, self.config, self.cutter = name, model.eval(), config, cutter
+
+    @property
+    def cuts_itself(self) -> bool:
+        """False for exported weights whose cuts a network drew, as that stays with the run."""
+        return self.cutter is not None or self.config["objective"].get("cuts", "motion") not in DRAWN
 
     def cuts(self, train: list[Demo], demos: list[Demo]) -> list[np.ndarray]:
         """Learned boundaries of demonstrations: ticks at which skills begin, and last T - 1. train: those that the

@@ -89,12 +89,13 @@ def text(results: dict) -> str:
         if r["about"].split()[0].isdigit() and int(r["about"].split()[0]) < 100:
             lines.append("- A handful of demonstrations, not the full set.")
         if "knn" in r["segment"]:
-            k, b = r["segment"]["knn"], r["segment"]["boundaries"]
-            lines.append(
-                f"- 5-NN {k['accuracy']:.3f} (majority {k['majority']:.3f}, untrained {k['untrained']:.3f}, PCA "
-                f"{k['pca']:.3f}); boundaries F1 {b['f1']:.3f} (fixed cut {b['fixed_cut_f1']:.3f}, mean times "
-                f"{b['mean_time_f1']:.3f})"
-            )
+            k = r["segment"]["knn"]
+            others = f"majority {k['majority']:.3f}, untrained {k['untrained']:.3f}, PCA {k['pca']:.3f}"
+            line = f"- 5-NN {k['accuracy']:.3f} ({others})"
+            if b := r["segment"].get("boundaries"):
+                others = f"fixed cut {b['fixed_cut_f1']:.3f}, mean times {b['mean_time_f1']:.3f}"
+                line += f"; boundaries F1 {b['f1']:.3f} ({others})"
+            lines.append(line)
         if "compositions" in r["segment"]:
             c = r["segment"]["compositions"]
             lines.append(

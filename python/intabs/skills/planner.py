@@ -232,7 +232,7 @@ class Planner:
             ranked.append((missing(goals, first[id(e)])[0], _apart(e.chain, seen), [e]))
         if len({g.slot for g in goals}) > 1:
             named = {g.slot: k for k, g in reversed(list(enumerate(goals)))}  # slot -> its first goal
-            turn = {id(e): min((named[i] for i in e.moved if i in named), default=len(goals)) for e in effects}
+            turn = {id(e): min(named[i] for i in e.moved if i in named) for e in effects}
             for a, b in product(effects, effects):
                 if set(a.moved) == set(b.moved):
                     continue

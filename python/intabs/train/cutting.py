@@ -18,7 +18,7 @@ import math
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor, distributed, nn
 
 from intabs.errors import UserError
 from intabs.model.networks import InteractionAbstractions, encoder_inputs, phase, phase_basis
@@ -36,11 +36,12 @@ STRETCH = 160  # ticks of a recording cut at a time
 WINDOWS = 4  # of a batch whose segmentations are all counted
 GRID = 2  # ticks: there they have their cuts
 TEMPERATURE = 0.5  # of the straight-through estimator
+CLIP = 10.0  # nats
 HIDDEN = 48
 
 
 class Cutter(nn.Module):
-    """For each tick of a window the logit that a skill begins there, (B, N), from what the encoders see."""
+    """For each tick of a window the logit that a skill begins there, (B, N), from agent, objects and what they do."""
 
     def __init__(self, model: InteractionAbstractions):
         super().__init__()
@@ -64,17 +65,16 @@ def load_cutter(model: InteractionAbstractions, state: dict | None) -> Cutter | 
     return cutter
 
 
-def draw(logit: Tensor, mask: Tensor, segment: tuple[int, int], chance: Tensor | None) -> Tensor:
+def draw(logit: Tensor, mask: Tensor, segment: tuple[int, int], chance: Tensor) -> Tensor:
     """Skills of segment[0] .. segment[1] ticks, the last of a window maybe shorter: (B, N) 1 where one begins. chance:
-    (B, N) uniform numbers; None: where it is likelier than not."""
+    (B, N) uniform numbers."""
     low, high = segment
     p = torch.sigmoid(logit.detach())
-    u = torch.full_like(p, 0.5) if chance is None else chance
     begins, age = torch.zeros_like(p), torch.zeros(len(p), device=p.device)
     begins[:, 0] = 1
     for t in range(1, p.shape[1]):
         age = age + 1
-        now = ((age >= low) & (u[:, t] < p[:, t]) | (age >= high)) & (mask[:, t] > 0)
+        now = ((age >= low) & (chance[:, t] < p[:, t]) | (age >= high)) & (mask[:, t] > 0)
         begins[:, t] = now.float()
         age = torch.where(now, 0, age)
     return begins
@@ -155,8 +155,8 @@ def gumbel_error(told: Told, z: Tensor, logit: Tensor, chance: Tensor, segment: 
 
 
 def reinforce_error(told: Told, z: Tensor, logit: Tensor, segment: tuple[int, int]) -> Tensor:
-    """-log p(b) weighed by how much less everything from there on costs than it does on average over the batch, in
-    deviations (Williams 1992; return to go, with a baseline)."""
+    """-log p(b) weighed by how much less everything from there on costs [nat] than it does on average over the batch
+    (Williams 1992; return to go, with a baseline); by no more than CLIP nats."""
     b = told.batch
     begins = begins_of(b)
     free = choices(begins, b.mask, segment)
@@ -165,9 +165,11 @@ def reinforce_error(told: Told, z: Tensor, logit: Tensor, segment: tuple[int, in
         cost = torch.zeros(begins.numel(), device=z.device)
         cost = cost.index_put((b.gather[b.within > 0],), errors[b.within > 0]).view_as(begins)
         to_go = cost.flip(1).cumsum(1).flip(1)
-        mean = (to_go * b.mask).sum(0) / b.mask.sum(0).clamp(min=1)
-        better = (mean - to_go) * free
-        better = better / better.std().clamp(min=1e-6)
+        sums = torch.stack([(to_go * b.mask).sum(0), b.mask.sum(0)])
+        if distributed.is_initialized():
+            distributed.all_reduce(sums)
+        mean = sums[0] / sums[1].clamp(min=1)
+        better = ((mean - to_go) * free).clamp(-CLIP, CLIP)
     log_p = -nn.functional.binary_cross_entropy_with_logits(logit, begins, reduction="none")
     return -mean_over(better * log_p, free)
 
@@ -196,12 +198,17 @@ def all_skills(batch: Windows, segment: tuple[int, int], grid: int = 1) -> tuple
 
 
 def exact_error(model: InteractionAbstractions, batch: Windows, segment: tuple[int, int]) -> Tensor:
-    """-log of the sum over all segmentations of the first windows of exp(-cost), a tick [nat]."""
-    few = batch.first(WINDOWS)
-    skills, place = all_skills(few, segment, GRID)
-    steps, last = few.mask.shape[1], few.mask.sum(1).long()
-    total = log_sum(table(costs(model, skills), place, len(few.mask), steps, segment[1]))
-    return (total.gather(1, last[:, None] - 1)[:, 0] / last).mean()
+    """-log of the sum over all segmentations of the first WINDOWS windows of exp(-cost), a tick [nat]."""
+    rows = batch.ours.rows if batch.ours else slice(None)  # of several processes each has its share of them
+    mine = min(len(range(WINDOWS)[rows]), len(batch.mask))
+    a_tick = batch.mask.new_zeros(0)
+    if mine:
+        few = batch.first(mine)
+        skills, place = all_skills(few, segment, GRID)
+        steps, last = few.mask.shape[1], few.mask.sum(1).long()
+        total = log_sum(table(costs(model, skills), place, mine, steps, segment[1]))
+        a_tick = total.gather(1, last[:, None] - 1)[:, 0] / last
+    return mean_over(a_tick, torch.ones_like(a_tick))
 
 
 def table(cost: Tensor, place: Tensor, windows: int, steps: int, longest: int) -> Tensor:
@@ -247,9 +254,21 @@ def own_cuts(model, state: State, command: Tensor | None, segment: tuple[int, in
         b = min(a + STRETCH, end)
         batch, place = all_skills(Windows.one(state[a : b + 1], command[a:b] if command is not None else None), segment)
         cost = costs(model, batch)
-        found = best_cuts(table(cost, place, 1, b - a, segment[1])[0].numpy(), b - a)
+        found = best_cuts(table(cost, place, 1, b - a, segment[1])[0].cpu().numpy(), b - a)
         cuts += [a + c for c in (found[1:] if b == end else found[1:-2] or found[1:2])]
     return np.array(cuts)
+
+
+def likeliest(logit: Tensor, segment: tuple[int, int]) -> np.ndarray:
+    """The most likely cuts of one recording by the network's logits (N,): ticks at which skills begin, and N."""
+    low, high = segment
+    gain = logit.double().numpy()
+    cost = np.full((high, len(gain)), np.inf)
+    for e in range(len(gain)):  # a skill that ends with tick e: what it costs is its beginning
+        for n in range(1, min(high, e + 1) + 1):
+            if n >= low or e == len(gain) - 1:
+                cost[n - 1, e] = -gain[e + 1 - n] if e + 1 > n else 0.0
+    return np.array(best_cuts(cost, len(gain)))
 
 
 class Cuts:
@@ -266,11 +285,12 @@ class Cuts:
 
     @torch.no_grad()
     def of(self, state: State, command: Tensor | None) -> np.ndarray:
-        """Ticks at which skills begin, and last T - 1. state (T, ...); command (T - 1, A) in units of its scale."""
+        """Ticks at which skills begin, and last T - 1. state (T, ...), command (T - 1, A) in units of its scale: on the
+        CPU."""
         if self.boundaries:
             return self.boundaries.cuts(state)
+        device = self.model.space.mean.device
+        state, command = state.map(lambda x: x.to(device)), command.to(device) if command is not None else None
         if self.cutter is None:
             return own_cuts(self.model, state, command, self.segment)
-        whole = Windows.one(state, command)
-        begins = draw(self.cutter.look(self.model, whole), whole.mask, self.segment, None)
-        return np.append(np.flatnonzero(begins[0].numpy()), len(state.agent) - 1)
+        return likeliest(self.cutter.look(self.model, Windows.one(state, command))[0].cpu(), self.segment)

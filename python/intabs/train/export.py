@@ -112,7 +112,7 @@ def export(
 ) -> dict:
     """Returns {sha256, tensors, max_abs_error, formats}. `trials`: closed-loop runs of each weight format;
     `practice`: of each demonstration's skills, for the library to know which do their task; 0: none.
-    Raises UserError if C++ and torch disagree by more than 1e-5. `out` changes when all is done, not before."""
+    Raises UserError if C++ and torch disagree by more than 1e-5. In `out` nothing changes until all is done."""
     model, checkpoint = load_model(run)
     data = checkpoint["data"]
     if not Path(data["path"]).exists() or file_hash(data["path"]) != data["sha256"]:
@@ -125,7 +125,9 @@ def export(
         raise UserError(
             f"{run}: sees objects as {model.space.layout}; C++ knows {_core.STATE_LAYOUT} (model.objects=gripper)"
         )
-    out = Path(out)
+    out = Path(out).resolve()
+    if out.exists() and not out.is_dir():
+        raise UserError(f"--out {out}: is a file; name a folder")
     partial = out.with_name(out.name + ".partial")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
@@ -205,7 +207,7 @@ def _write(model: InteractionAbstractions, checkpoint: dict, out: Path, trials, 
 
     error = verify(out)
     if not error <= TOLERANCE:
-        raise UserError(f"{out}: the C++ network differs from torch by {error:.2e}, more than {TOLERANCE:.0e}")
+        raise UserError(f"the C++ network differs from torch by {error:.2e}, more than {TOLERANCE:.0e}")
     held_out, _ = load_demos(checkpoint["data"]["path"], "valid")
     formats = format_report(out, model, held_out or demos, trials)
     return {"sha256": sha256, "tensors": len(tensors), "max_abs_error": error, "formats": formats}

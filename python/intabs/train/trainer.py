@@ -62,8 +62,8 @@ def load_config(name_or_file: str, overrides: list[str]) -> dict:
         raise UserError(f"{path}: no settings in it; start from one of {CONFIGS.name}/*.yaml")
     if "base" in config:  # another one with changes
         config = _merged(load_config(config.pop("base"), []), config, path)
-    elif missing := {"model", "objective", "noise", "train"} - set(config):
-        raise UserError(f"{path}: has no {min(missing)}; start from one of {CONFIGS.name}/*.yaml")
+    elif missing := missing_settings(config):
+        raise UserError(f"{path}: has no {missing}; start from one of {CONFIGS.name}/*.yaml")
     for item in overrides:
         key, sep, value = item.partition("=")
         node = config
@@ -78,10 +78,22 @@ def load_config(name_or_file: str, overrides: list[str]) -> dict:
         if type(new) is not type(node[last]):
             raise UserError(f"--set {item}: wants a value like {node[last]}")
         node[last] = new
-    for key, least in (("steps", 1), ("batch", 1), ("patience", 0)):
-        if config["train"][key] < least:
-            raise UserError(f"train.{key} is {config['train'][key]}: must be {least} or more")
+    least = {("train", "steps"): 1, ("train", "batch"): 1, ("train", "patience"): 0, ("objective", "lead"): 0}
+    for (group, key), value in least.items():
+        if config[group][key] < value:
+            raise UserError(f"{group}.{key} is {config[group][key]}: must be {value} or more")
     return config
+
+
+def missing_settings(config: dict) -> str:
+    """The first of intabs-small's that is not there."""
+    for group, settings in yaml.safe_load((CONFIGS / "intabs-small.yaml").read_text()).items():
+        if not isinstance(config.get(group), dict):
+            return group
+        for key in settings:
+            if key not in config[group]:
+                return f"{group}.{key}"
+    return ""
 
 
 def _merged(base: dict, changes: dict, path: Path) -> dict:
@@ -172,14 +184,15 @@ class Trainer:
         self.model = InteractionAbstractions(config["model"], space)
         self.rollout_error = RolloutError(self.scaling)
         start_linear(self.model, self.sampler, self.rollout_error, o["rollout"], seed)
-        self.model.to(device)
-        self.rollout_error.to(device)
-        self.cutter = cutting.Cutter(self.model).to(device) if o["cuts"] in cutting.DRAWN else None
+        self.cutter = cutting.Cutter(self.model) if o["cuts"] in cutting.DRAWN else None
         self.cuts = cutting.Cuts(self.model, [d.state for d in recorded], o, self.cutter)
         self.recorded = recorded
         self.found: dict[str, list[int]] = {}  # where the recordings' skills begin
-        if self.cuts.kind == "motion":
+        if self.cuts.kind == "motion":  # from recordings alone, which stay on the CPU
             self._recut()
+        for module in (self.model, self.rollout_error, self.cutter):
+            if module is not None:
+                module.to(device)
         t = config["train"]
         self.optimizer = torch.optim.AdamW(self._parameters(), lr=t["lr"], weight_decay=t["weight_decay"])
         self.scheduler = torch.optim.lr_scheduler.LambdaLR(self.optimizer, self._rate)
@@ -225,6 +238,7 @@ class Trainer:
         lost = strayed.amax(1) > LOST
         if recorded.p.shape[1]:
             lost |= ((end.p - recorded.p).norm(dim=-1) * recorded.known).amax(1) > LOST_M
+            lost |= ((before.state.known[:, 0] != recorded.known) | (before.state.valid[:, 0] != recorded.valid)).any(1)
         return end.either(recorded, ~lost)
 
     def _loss(
@@ -496,6 +510,8 @@ class Trainer:
         c = load_checkpoint(self.run)
         if c["config"]["model"] != self.config["model"]:
             raise UserError(f"{self.path}: was trained with another model configuration")
+        if c["config"]["objective"].get("cuts", "motion") != self.cuts.kind:
+            raise UserError(f"{self.path}: was trained with other objective.cuts")
         if c["data"]["sha256"] != file_hash(self.data):
             raise UserError(f"{self.path}: was trained on other data ({c['data']['path']})")
         if c["data"]["replays_sha256"] != (file_hash(self.replays) if self.replays else ""):
