@@ -188,7 +188,8 @@ def skills_of(begins: Tensor, mask: Tensor) -> tuple[Tensor, ...]:
 
 class WindowSampler:
     """A demonstration is drawn by the root of its length: a task that takes three times as long as another is
-    neither three times as important nor as quickly learned. Each of its ticks is equally likely to begin a window.
+    neither three times as important nor as quickly learned. Each of its ticks is equally likely to begin a window;
+    with a lead, each that has it before.
 
     ticks: N; segment: shortest and longest skill drawn; cuts: instead of drawing, for each demonstration the ticks at
     which skills begin and, last, T - 1. augment: {"turn": rad} of the whole scene about the base (the Lite 6) or
