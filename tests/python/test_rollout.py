@@ -18,6 +18,13 @@ if not (WEIGHTS / "manifest.json").exists():
     pytest.skip(f"{WEIGHTS} is not there: train and export first", allow_module_level=True)
 
 
+def test_an_interval_holds_the_rate_it_is_of():
+    for n in range(1, 60):
+        for k in (0, n):
+            low, high = wilson(k, n)
+            assert low <= k / n <= high
+
+
 def test_wilson_interval_is_the_known_one():
     low, high = wilson(42, 50)
     assert abs(low - 0.7149) < 1e-3 and abs(high - 0.9166) < 1e-3
