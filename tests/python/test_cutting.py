@@ -8,6 +8,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="torch is not installed: tools/setup installs it")
 
+from test_learning import SMALL, record, train, two_train_as_one  # noqa: E402
+
+from intabs.data.demos import load_demos, save_demos  # noqa: E402
 from intabs.train.cutting import (  # noqa: E402
     RATE,
     all_skills,
@@ -20,9 +23,17 @@ from intabs.train.cutting import (  # noqa: E402
     straight_through,
     table,
 )
+from intabs.train.trainer import Trainer, load_config  # noqa: E402
 from intabs.train.windows import Windows, skills_of  # noqa: E402
 
 SEGMENT = (2, 4)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory):
+    path = tmp_path_factory.mktemp("data") / "demos.hdf5"
+    save_demos(path, [record(seed) for seed in range(3)], {"task": "pick_place"}, valid_share=0.25)
+    return path
 
 
 def windows(counts, steps):
@@ -123,3 +134,78 @@ def test_the_prior_is_its_own_least():
         p = 1 / (1 + math.exp(-other))
         expected = p * math.log(p / RATE) + (1 - p) * math.log((1 - p) / (1 - RATE))
         assert math.isclose(float(prior_error(torch.full((1, 4), other), free)), expected, rel_tol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["viterbi", "exact", "gumbel", "reinforce"])
+def test_every_kind_of_cuts_trains_resumes_and_cuts_what_is_held_out(data, tmp_path, kind):
+    from intabs.evaluate.evaluate import load_learned
+
+    extra = [f"objective.cuts={kind}", "objective.joint_from=0.25"]
+    whole = train(data, tmp_path / "whole", 8, extra=extra)
+    train(data, tmp_path / "part", 8, stop_at=5, extra=extra)
+    again = Trainer(load_config("intabs-small", [*SMALL, *extra, "train.steps=8"]), data, tmp_path / "part", 0, "cpu")
+    again.resume()
+    again.train()
+    for a, b in zip(whole._parameters(), again._parameters(), strict=True):
+        assert torch.equal(a, b)
+    demos, _ = load_demos(data)
+    before = whole.cuts.of(*(lambda d: (d.state, d.command))(whole.recorded[0]))
+    for d, cuts in zip(demos, load_learned(tmp_path / "whole").cuts(demos, demos), strict=True):
+        assert cuts[0] == 0 and cuts[-1] == len(d) - 1
+        assert (np.diff(cuts)[:-1] >= 8).all() and np.diff(cuts).max() <= 24
+    assert len(before) > 4
+
+
+def test_drawn_cuts_learn_where_the_motion_changes():
+    """One number that is 0, then 1: z says it, pi repeats it; a skill that spans both costs. Cuts are to go there."""
+    from intabs.train import cutting
+
+    class Teller:
+        """Stands for encoders and pi: z is the mean of what the skill's ticks say, pi repeats z."""
+
+        def __init__(self, x, batch):
+            self.x, self.batch = x, batch
+
+        def z(self):
+            b = self.batch
+            return (b.pieces(self.x) * b.within[..., None]).sum(1) / b.within.sum(1, keepdim=True)
+
+        def errors(self, z):
+            seen = self.batch.pieces(self.x)
+            z = z if z.dim() == 3 else z[:, None].expand_as(seen)
+            return ((z - seen) ** 2).sum(-1) / (2 * 0.1**2) * self.batch.within
+
+    segment, steps, rng = (2, 12), 16, np.random.default_rng(0)
+    for kind in ("gumbel", "reinforce"):
+        torch.manual_seed(0)
+        net = torch.nn.Linear(3, 1)  # sees the tick before, this one and the next
+        optimizer = torch.optim.Adam(net.parameters(), 0.05)
+        for _ in range(400):
+            at = torch.from_numpy(rng.integers(4, 12, 64))
+            x = (torch.arange(steps)[None] >= at[:, None]).float()[..., None]
+            seen = torch.cat([x.roll(1, 1), x, x.roll(-1, 1)], -1)
+            mask = torch.ones(64, steps)
+            logit = net(seen)[..., 0]
+            chance = torch.from_numpy(rng.random((64, steps), dtype="f4"))
+            begins = cutting.draw(logit, mask, segment, chance)
+            told = Teller(x, Windows(None, None, None, None, mask, *skills_of(begins, mask)))
+            if kind == "gumbel":
+                noise = torch.from_numpy(rng.random((64, steps), dtype="f4"))
+                error = cutting.gumbel_error(told, told.z(), logit, noise, segment)
+            else:
+                error = cutting.reinforce_error(told, told.z(), logit, segment)
+            free = cutting.choices(begins, mask, segment)
+            optimizer.zero_grad()
+            (error + cutting.prior_error(logit, free)).backward()
+            optimizer.step()
+        for at in range(4, 12):
+            x = (torch.arange(steps) >= at).float()
+            seen = torch.stack([x.roll(1), x, x.roll(-1)], -1)
+            seen[0] = seen[1]
+            seen[-1] = seen[-2]
+            assert cutting.likeliest(net(seen)[:, 0].detach(), segment).tolist() == [0, at, steps], (kind, at)
+
+
+@pytest.mark.parametrize("kind", ["exact", "gumbel", "reinforce"])
+def test_two_processes_cut_as_one_does(data, tmp_path, kind):
+    two_train_as_one(data, tmp_path, kind)
