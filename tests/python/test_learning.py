@@ -189,6 +189,12 @@ def test_a_window_with_a_lead_is_cut_where_the_lead_ends(demonstrations):
     before, after = whole.split(60)
     assert before.skill.shape == (32, 60) and after.skill.shape == (32, 40) and before.mask.all()
     assert torch.equal(before.state.agent[:, -1], after.state.agent[:, 0])
+    # The window is the one without a lead, but for those with too little before them, whose lead is the beginning.
+    plain = sampler.sample(32, np.random.default_rng(0))
+    begins = {tuple(d.state.agent[0].tolist()) for d in found}
+    same = (plain.state.agent[:, 0] == after.state.agent[:, 0]).all(1)
+    early = torch.tensor([tuple(x.tolist()) in begins for x in before.state.agent[:, 0]])
+    assert (same | early).all() and same.sum() > 16
     for part, state in ((before, whole.state[:, :61]), (after, whole.state[:, 60:])):
         assert torch.equal(part.state.p, state.p)
         skill = part.skill.flatten()
