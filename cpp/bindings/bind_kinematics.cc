@@ -18,6 +18,9 @@ PoseArray ToArray(const Pose& X) {
   return a;
 }
 
+template <int kColumns>
+using Path = Eigen::Matrix<double, Eigen::Dynamic, kColumns, Eigen::RowMajor>;
+
 Pose ToPose(const PoseArray& a) { return {a.head<3>(), Eigen::Quaterniond(a[3], a[4], a[5], a[6])}; }
 
 }  // namespace
@@ -35,6 +38,24 @@ void Bind_kinematics(py::module_& m) {
       .def(
           "tip", [](const ArmModel& arm, const JointVector& q) { return ToArray(arm.Tip(q)); }, "q"_a,
           "Pose (7,) of the gripper's tip in the base.")
+      .def(
+          "places",
+          [](const ArmModel& arm, const JointVector& q) {
+            Eigen::Matrix<double, kNumJoints + 2, 3, Eigen::RowMajor> line;
+            const ArmModel::Line places = arm.Places(q);
+            for (int i = 0; i < kNumJoints + 2; ++i) line.row(i) = places[i];
+            return line;
+          },
+          "q"_a, "(8, 3): the base, the joints and the gripper's tip in the base.")
+      .def(
+          "distance_from",
+          [](const ArmModel& arm, const Path<kNumJoints>& q, const Path<3>& p) {
+            if (q.rows() != p.rows()) throw py::value_error("q and p must have as many rows");
+            Eigen::VectorXd out(q.rows());
+            for (Eigen::Index t = 0; t < q.rows(); ++t) out[t] = arm.DistanceFrom(q.row(t), p.row(t));
+            return out;
+          },
+          "q"_a, "p"_a, "(T,) [m]: of points p (T, 3) in the base from the arm's line from elbow to tip at q (T, 6).")
       .def("jacobian", &ArmModel::Jacobian, "q"_a,
            "(6, 6): linear [m/s], then angular [rad/s] velocity of the tip in the base, by joint velocity.")
       .def_property_readonly(

@@ -491,6 +491,29 @@ def test_objects_may_be_seen_in_the_world_but_not_exported_so(data, tmp_path, ob
         export(tmp_path / "run", tmp_path / "weights", trials=0)
 
 
+@pytest.mark.parametrize(("objects", "at"), [("gripper", [3]), ("both", [3, 14])])
+def test_orientations_may_be_quaternions_but_not_exported_so(data, tmp_path, objects, at):
+    from scipy.spatial.transform import Rotation
+
+    from intabs.train.export import export
+
+    extra = [f"model.objects={objects}", "model.rotation=quaternion"]
+    trainer = train(data, tmp_path / "run", stop_at=2, extra=extra)
+    space = trainer.model.space
+    s = trainer.recorded[0].state
+    raw, (_, R_WG) = space.raw(s)
+    raw = raw[:, 7:].unflatten(-1, (4, -1))
+    for k, R in zip(at, (R_WG.transpose(-1, -2)[:, None] @ s.R, s.R), strict=False):
+        want = torch.from_numpy(np.roll(Rotation.from_matrix(R.reshape(-1, 3, 3).numpy()).as_quat(), 1, -1)).float()
+        got = raw[..., k : k + 4].reshape(-1, 4)
+        same = (want * got).sum(-1).abs()
+        used = (s.known > 0).reshape(-1)
+        assert used.any() and (same[used] > 1 - 1e-4).all() and (got[~used] == 0).all()
+    assert load_model(tmp_path / "run")[0].space.layout.endswith(" quaternion")
+    with pytest.raises(UserError, match="model.rotation=columns"):
+        export(tmp_path / "run", tmp_path / "weights", trials=0)
+
+
 def test_exported_weights_come_back_as_the_same_model(data, tmp_path):
     pytest.importorskip("safetensors")
     from intabs.train.export import export, load_weights

@@ -6,10 +6,15 @@ from test_learning import record
 
 pytest.importorskip("torch")
 
-from intabs import _core  # noqa: E402
+from intabs import (
+    _core,  # noqa: E402
+    paths,  # noqa: E402
+)
 from intabs.data.demos import load_demos, save_demos  # noqa: E402
 from intabs.data.reader import DemoFile  # noqa: E402
-from intabs.replay.replay import Replayer, displacement, make, outline, pad_slots  # noqa: E402
+from intabs.errors import UserError  # noqa: E402
+from intabs.model.space import state_of  # noqa: E402
+from intabs.replay.replay import ANOTHER_SIDE, Replayer, Try, attempt, displacement, make, outline, pad_slots  # noqa: E402
 
 
 @pytest.fixture(scope="module")
@@ -47,6 +52,62 @@ def test_a_grasp_goes_along_with_its_object(demo):
     np.testing.assert_allclose(path[-1], replayer.commands(demo, about, demo.object_pose[0])[-1], atol=2e-3)
 
 
+@pytest.fixture(scope="module")
+def poured():
+    """Recordings of pour, (name, demonstration)."""
+    with DemoFile(paths.MODELS / "demos/lite6.hdf5", "train") as f:
+        pours = [k for k in range(len(f)) if f.own_attrs(k)["task"] == "pour"]
+        return [(f.names[k], pad_slots(f.demo(k))) for k in pours]
+
+
+def test_a_bowl_may_be_come_to_from_another_side(poured):
+    demo = poured[0][1]
+    replayer = Replayer("pour")
+    about = outline(demo, replayer.arm)
+    assert (about.mover, about.other) == (0, 1)  # the cup, to the bowl
+    paths_ = [replayer.commands(demo, about, demo.object_pose[0], side) for side in (0.0, ANOTHER_SIDE)]
+    tip = [np.array([replayer.arm.tip(q) for q in path]) for path in paths_]
+    away = [x[:, :2] - demo.object_pose[0, 1, :2] for x in tip]
+    pouring = int(np.argmin(np.linalg.norm(demo.object_pose[:, 0, :3] - demo.object_pose[0, 1, :3], axis=1)))
+    angle = [np.arctan2(*a[pouring, ::-1]) for a in away]
+    assert np.remainder(angle[1] - angle[0], 2 * np.pi) == pytest.approx(ANOTHER_SIDE, abs=1e-3)
+    np.testing.assert_allclose(*(np.linalg.norm(a[pouring]) for a in away), atol=1e-3)
+    np.testing.assert_allclose(tip[0][:, 2], tip[1][:, 2], atol=1e-3)
+    grasp = int(np.argmax(about.gripper))
+    np.testing.assert_allclose(tip[0][: grasp + 1], tip[1][: grasp + 1], atol=1e-3)  # and taken as it was
+    np.testing.assert_allclose(tip[0][-1, :3], tip[1][-1, :3], atol=0.02)  # and set down where it was
+
+
+def test_replays_from_other_sides_succeed_and_a_library_takes_the_one_most_like_its_recording(poured, tmp_path):
+    from intabs.train.export import other_sides
+    from intabs.train.trainer import file_hash, load_space
+    from intabs.train.windows import WindowSampler, prepare
+
+    data, out = tmp_path / "recorded.hdf5", tmp_path / "replays.hdf5"
+    save_demos(data, [poured[1][1]], {"embodiment": "lite6", "rate_hz": 25.0}, valid_share=0.0)
+    (name,) = DemoFile(data).names
+    replays = []
+    for seed, side in ((7, 0.0), (8, ANOTHER_SIDE)):
+        _, replay = attempt(Try(name, poured[1][1], seed, 0.5, 0.0, None, side))
+        assert replay.attrs["side"] == side
+        replay.attrs |= {"task": "pour", "source": name}
+        replays.append(replay)
+    save_demos(out, replays, {"embodiment": "lite6", "rate_hz": 25.0}, valid_share=0.0)
+    recorded = {name: load_demos(data)[0][0]}
+    made = {"replays_path": str(out), "replays_sha256": file_hash(out)}
+    found = other_sides(made, recorded)
+    assert [x[:2] for x in found] == [(f"{name} {np.degrees(ANOTHER_SIDE):+.0f} deg", name)]
+    assert len(found[0][2]) == len(recorded[name])
+    assert other_sides({}, recorded) == []
+    with pytest.raises(UserError, match="not the replays of the training"):
+        other_sides(made | {"replays_sha256": ""}, recorded)
+    # What the encoders are shown of another replay is the same motion.
+    space = load_space(replays, "gripper")
+    space.fit([state_of(d) for d in replays])
+    three = prepare([*replays, replays[0]], space, [name] * 3)
+    assert [x.tolist() for x in WindowSampler(three, space, 20, (8, 20)).same] == [[0, 2], [1], [0, 2]]
+
+
 def test_a_turn_in_the_plane_is_measured():
     old = np.array([0.1, 0.2, 0, 1, 0, 0, 0])
     new = np.array([0.15, 0.1, 0, np.cos(0.2), 0, 0, np.sin(0.2)])
@@ -74,7 +135,6 @@ def test_replays_succeed_with_the_objects_elsewhere_and_keep_their_recordings_ti
 def test_training_takes_replays_and_leaves_out_those_of_held_out_demonstrations(demo, tmp_path):
     from test_learning import SMALL
 
-    from intabs.errors import UserError
     from intabs.train.trainer import Trainer, load_config
 
     data, out = tmp_path / "recorded.hdf5", tmp_path / "replays.hdf5"

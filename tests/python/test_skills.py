@@ -129,6 +129,23 @@ def test_a_plan_is_found_for_a_goal_and_for_what_a_task_leaves_behind(made, libr
         planner.find([Goal(3, goals[0].pose)], scene)
 
 
+def test_a_plan_does_not_lead_the_arm_through_what_it_does_not_concern(made, scene):
+    planner = Planner(made[0])
+    goals = goals_of(planner.library, "pick_place", scene)
+    plan = planner.find(goals, scene)
+    way = planner.head.run(scene.q, scene.gripper_closed, scene.object_pose, scene.known, [plan.arrays()[0]],
+                           [[s.ticks for s in plan.skills]])["q"][0]  # fmt: skip
+    pose, known = scene.object_pose.copy(), scene.known.copy()
+    known[2] = True  # a stranger
+    effects = [e for e in planner.effects if e.chain == plan.skills]
+    for offset, meets in (([0, 0, 0.5], False), ([0, 0, 0.03], True)):
+        pose[2, :3] = planner.arm.tip(way[len(way) // 2])[:3] + offset
+        there = Frame(scene.q, scene.gripper_closed, pose, known)
+        assert planner._meets(effects, there, way, np.repeat(pose[None], len(way), 0)) == meets
+    effects[0].concerns.add(2)
+    assert not planner._meets(effects, there, way, np.repeat(pose[None], len(way), 0))
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [

@@ -2,6 +2,7 @@
 // Frames: B arm base, J_i frame of link i (turns about its z by q_i), E flange = J_6, G gripper tip.
 #pragma once
 
+#include <algorithm>
 #include <array>
 #include <cmath>
 #include <numbers>
@@ -56,6 +57,30 @@ class ArmModel {
 
   // X_BG, the tip.
   Pose Tip(const JointVector& q) const noexcept { return Fk(q) * parameters_.X_EG; }
+
+  // The arm's line in B [m]: the base, the origins of J_1 ... J_6, the tip.
+  using Line = std::array<Eigen::Vector3d, kNumJoints + 2>;
+  Line Places(const JointVector& q) const noexcept {
+    const Chain chain = Walk(q);
+    Line line;
+    line[0].setZero();
+    for (int i = 0; i < kNumJoints; ++i) line[i + 1] = chain.p[i];
+    line[kNumJoints + 1] = chain.p[kNumJoints - 1] + chain.R[kNumJoints - 1] * parameters_.X_EG.p;
+    return line;
+  }
+
+  // Of a point p_BX from the line's part from the elbow (J_3) to the tip [m]; the arm's body is some 4 cm thick around it.
+  double DistanceFrom(const JointVector& q, const Eigen::Vector3d& p_BX) const noexcept {
+    const Line line = Places(q);
+    double least = (p_BX - line[3]).squaredNorm();
+    for (size_t i = 4; i < line.size(); ++i) {
+      const Eigen::Vector3d along = line[i] - line[i - 1], to = p_BX - line[i - 1];
+      const double length = along.squaredNorm();
+      const double t = length > 0 ? std::clamp(to.dot(along) / length, 0.0, 1.0) : 0.0;
+      least = std::min(least, (to - t * along).squaredNorm());
+    }
+    return std::sqrt(least);
+  }
 
   // At the tip.
   ArmJacobian Jacobian(const JointVector& q) const noexcept {

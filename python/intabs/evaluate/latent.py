@@ -115,9 +115,8 @@ def _agent_line(agent: np.ndarray) -> np.ndarray:
     """Places of the Lite 6's joints and tip (8, 3); of a hand its keypoints; of another agent nothing."""
     if len(agent) == 7:
         from intabs import _core
-        from intabs.skills.library import arm_line
 
-        return arm_line(_core.ArmModel.lite6(), agent[:6])
+        return _core.ArmModel.lite6().places(agent[:6])
     if len(agent) % 3 == 0 and len(agent) >= 63:
         return agent[:63].reshape(21, 3)
     return np.zeros((0, 3))

@@ -27,6 +27,17 @@ def rotation(quaternion: np.ndarray) -> np.ndarray:
     return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
+def quaternion(columns: Tensor) -> Tensor:
+    """First two columns (..., 6) of rotations -> wxyz (..., 4), w >= 0: jumps at half turns. Zeros give zeros."""
+    a, b = columns[..., :3], columns[..., 3:]
+    c = torch.linalg.cross(a, b)
+    xx, yy, zz = a[..., 0], b[..., 1], c[..., 2]
+    squares = torch.stack([1 + xx + yy + zz, 1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz], -1)
+    signs = torch.stack([torch.ones_like(xx), b[..., 2] - c[..., 1], c[..., 0] - a[..., 2], a[..., 1] - b[..., 0]], -1)
+    q = 0.5 * squares.clamp(min=1e-8).sqrt() * torch.where(signs < 0, -1.0, 1.0)
+    return q * (columns.abs().sum(-1, keepdim=True) > 0)
+
+
 def cross_matrix(w: Tensor) -> Tensor:
     """(..., 3) -> (..., 3, 3), [w]x."""
     x, y, z = w.unbind(-1)

@@ -20,6 +20,7 @@ LIMIT = 5.0  # normalised features are clamped there
 Tip = tuple[Tensor, Tensor]  # p_WG (..., 3), R_WG (..., 3, 3)
 LAYOUTS = {"gripper-relative/2": 13, "world/1": 10, "both/1": 23}  # numbers an object
 OBJECTS = {"gripper": "gripper-relative/2", "world": "world/1", "both": "both/1"}  # how the Lite 6's are seen
+ROTATIONS = {"columns": 6, "quaternion": 4}  # numbers of an object's orientation: the first two columns of R, or wxyz
 
 
 @dataclass
@@ -74,17 +75,25 @@ def state_of(demo: Demo) -> tuple[State, np.ndarray | None]:
 
 class Space(nn.Module):
     """Sizes, scales of the training split, features. arm: intabs._core.ArmModel for the Lite 6, None otherwise.
-    objects: one of OBJECTS, for the Lite 6; its runtime knows "gripper" alone."""
+    objects: one of OBJECTS, for the Lite 6; its runtime knows "gripper" alone. rotation: one of ROTATIONS; the runtime
+    knows "columns" alone."""
 
-    def __init__(self, agent: int, slots: int, environment: int, arm=None, objects: str = "gripper"):
+    def __init__(
+        self, agent: int, slots: int, environment: int, arm=None, objects: str = "gripper", rotation: str = "columns"
+    ):
         super().__init__()
         self.agent, self.slots, self.environment = agent, slots, environment
         self.arm = kinematics.Arm(arm) if arm is not None else None
         if objects not in OBJECTS:
             raise UserError(f"model.objects is {objects!r}: write one of {', '.join(OBJECTS)}")
-        self.objects, self.layout = objects, OBJECTS[objects if arm is not None else "world"]
+        if rotation not in ROTATIONS:
+            raise UserError(f"model.rotation is {rotation!r}: write one of {', '.join(ROTATIONS)}")
+        self.objects, self.rotation = objects, rotation
+        layout = OBJECTS[objects if arm is not None else "world"]
+        self.layout = layout if rotation == "columns" else f"{layout} {rotation}"
         self.joints = agent - 1 if arm is not None else agent  # what moves by steps; the gripper is set
-        self.environment_dim = slots * LAYOUTS[self.layout] + environment
+        frames = 1 + (layout == OBJECTS["both"])
+        self.environment_dim = slots * (LAYOUTS[layout] + frames * (ROTATIONS[rotation] - 6)) + environment
         self.change_dim = 6 * slots + environment  # of a^e
         for name, n in (
             ("mean", agent + self.environment_dim),
@@ -103,13 +112,14 @@ class Space(nn.Module):
     def config(self) -> dict:
         return {
             "agent": self.agent, "slots": self.slots, "environment": self.environment, "lite6": self.arm is not None,
-            "objects": self.objects,
+            "objects": self.objects, "rotation": self.rotation,
         }  # fmt: skip
 
     @staticmethod
     def from_config(config: dict, arm) -> Space:
         arm = arm if config["lite6"] else None
-        return Space(config["agent"], config["slots"], config["environment"], arm, config.get("objects", "gripper"))
+        seen = config.get("objects", "gripper"), config.get("rotation", "columns")
+        return Space(config["agent"], config["slots"], config["environment"], arm, *seen)
 
     def fit(self, demos: list[tuple[State, np.ndarray | None]]) -> None:
         """Scales from the training split."""
@@ -159,9 +169,11 @@ class Space(nn.Module):
             q, gripper = s.agent[..., :-1], s.agent[..., -1]
             features, tip = kinematics.state_features(self.arm, q, gripper, s.p, s.R, s.known, s.valid)
             parts = [features[..., self.agent :].unflatten(-1, (self.slots, -1))] * (self.objects != "world")
-        if self.layout != "gripper-relative/2":
+        if self.arm is None or self.objects != "gripper":
             columns = torch.cat([s.R[..., 0], s.R[..., 1]], -1)
             parts.append(torch.cat([s.p, columns, s.valid[..., None]], -1) * s.known[..., None])
+        if self.rotation == "quaternion":  # the columns stand at the same place in each frame's numbers
+            parts = [torch.cat([x[..., :3], kinematics.quaternion(x[..., 3:9]), x[..., 9:]], -1) for x in parts]
         return torch.cat([s.agent, torch.cat(parts, -1).flatten(-2), s.environment], -1), tip
 
     def features(self, s: State) -> tuple[Tensor, Tip | None]:

@@ -3,8 +3,9 @@ tried in the plant. From a recording alone: its commands and what was seen; noth
 
 The tip's commanded path X(t) becomes D(t) X(t). D moves along with what the motion is about: not at all at the start,
 then with the object that will be moved (its displacement D_i), then, as it comes near another object, with that one's
-(D_j). Inverse kinematics gives the new commands. After Mandlekar et al., MimicGen (2023), with references that go over
-into each other instead of cut pieces.
+(D_j). Inverse kinematics gives the new commands. To what is round, a bowl, things may come from another side: some
+replays turn the way there and back about its axis. After Mandlekar et al., MimicGen (2023), with references that go
+over into each other instead of cut pieces.
 """
 
 from __future__ import annotations
@@ -35,6 +36,9 @@ MAX_STEP = 0.08  # rad a tick (2 rad/s): a path that is faster is not tried
 ELSEWHERE = 0.5  # share of the replays that do not start at home: half of them where another demonstration ended,
 START_RAD = 0.15  # half of them so far from home (standard deviation, each joint)
 DRIVE_STEP = 0.03  # rad a tick, on the way to such a start
+ROUND = {("pour", 1)}  # task, slot: objects that things may come to from any side,
+ANOTHER_SIDE = 1.1  # rad: about their axis by so much, in a third of the tries each way
+NEAR_ROUND = 0.13  # m, moved object from the round one: there it has come round
 
 
 @dataclass
@@ -47,6 +51,7 @@ class Outline:
     other: int  # slot of what it is brought to; -1: nothing
     to_mover: np.ndarray  # (T,) 0 .. 1
     to_other: np.ndarray  # (T,) 0 .. 1
+    at_other: np.ndarray  # (T,) 0 .. 1, and back
 
 
 def outline(demo: Demo, arm) -> Outline | None:
@@ -78,21 +83,22 @@ def outline(demo: Demo, arm) -> Outline | None:
     to_mover = _progress(np.linalg.norm(tip - tip[began], axis=1), NEAR_GRASP)
     to_mover[began:] = 1
     others = [j for j in seen if j != mover]
-    other, to_other = -1, np.zeros(len(p))
+    other, to_other, at_other = -1, np.zeros(len(p)), np.zeros(len(p))
     if others and far[mover] > 3 * MOVED:
         distance = np.array([np.linalg.norm(path - p[:, j].mean(0), axis=1) for j in others])
         k = int(np.argmin(distance[:, began:].min(1)))
         other = others[k]
         to_other = _progress(distance[k], NEAR_GOAL)
         to_other[:began] = 0
-    return Outline(target, demo.actions[:, 6] > 0, mover, other, to_mover, to_other)
+        at_other = _progress(distance[k], NEAR_ROUND, back=True)
+    return Outline(target, demo.actions[:, 6] > 0, mover, other, to_mover, to_other, at_other)
 
 
-def _progress(distance: np.ndarray, near: float) -> np.ndarray:
-    """0 at the first distance, 1 from `near` on; never back, smoothed."""
+def _progress(distance: np.ndarray, near: float, back: bool = False) -> np.ndarray:
+    """0 at the first distance, 1 from `near` on; never back unless asked for, smoothed."""
     start = max(distance[0], near + 1e-3)
     w = np.clip((start - distance) / (start - min(near, 0.8 * start)), 0, 1)
-    w = np.maximum.accumulate(w)
+    w = w if back else np.maximum.accumulate(w)
     w = w * w * (3 - 2 * w)
     return np.clip(gaussian_filter1d(w, SMOOTH), 0, 1)
 
@@ -123,8 +129,9 @@ class Replayer:
         self.arm = _core.ArmModel.lite6()
         self.ik = _core.IkSolver(self.arm)
 
-    def commands(self, demo: Demo, about: Outline, new: np.ndarray) -> np.ndarray | None:
-        """Joint targets (T, 6) for objects at `new` (S, 7); None if they cannot be reached smoothly."""
+    def commands(self, demo: Demo, about: Outline, new: np.ndarray, side: float = 0.0) -> np.ndarray | None:
+        """Joint targets (T, 6) for objects at `new` (S, 7); None if they cannot be reached smoothly. side: angle about
+        the axis of what the moved object is brought to, from which it comes instead [rad]."""
         first = {
             i: demo.object_pose[np.argmax(demo.object_valid[:, i]), i] for i in (about.mover, about.other) if i >= 0
         }
@@ -142,8 +149,11 @@ class Replayer:
                 turned = Rotation.from_rotvec([0, 0, angle]).apply(p - first[i][:3])
                 shift = shift + weight * (first[i][:3] + step + turned - p)
                 yaw += weight * angle
-            turn = Rotation.from_rotvec([0, 0, yaw]) * R
-            pose = np.concatenate([p + shift, np.roll(turn.as_quat(), 1)])
+            turn, p = Rotation.from_rotvec([0, 0, yaw]) * R, p + shift
+            if side:
+                round_it, axis = Rotation.from_rotvec([0, 0, side * about.at_other[t]]), new[about.other, :3]
+                turn, p = round_it * turn, axis + round_it.apply(p - axis)
+            pose = np.concatenate([p, np.roll(turn.as_quat(), 1)])
             answer = self.ik.solve(pose, q)
             if not answer.ok:
                 return None
@@ -154,19 +164,26 @@ class Replayer:
         return np.stack(out)
 
     def replay(
-        self, demo: Demo, about: Outline, seed: int, spread_cm: float, disturb: float, start: np.ndarray | None = None
+        self,
+        demo: Demo,
+        about: Outline,
+        seed: int,
+        spread_cm: float,
+        disturb: float,
+        start: np.ndarray | None = None,
+        side: float = 0.0,
     ) -> Demo | str:
         """One try with the objects where the plant puts them for this seed; the reason if it failed.
 
         disturb: standard deviation [rad] of pushes the commands get now and then and take back (Laskey et al., DART,
         2017); what is recorded as the action takes back, it does not push. start: joints (6,) [rad] to begin at; None:
-        the recording's. The way there is not recorded."""
+        the recording's. The way there is not recorded. side: as for commands."""
         session = self.session
         session.reset(seed, spread_cm)
         rng = np.random.default_rng(seed)
-        path = self.commands(demo, about, session.observe()["object_pose"])
+        path = self.commands(demo, about, session.observe()["object_pose"], side)
         if path is None:
-            return "out of reach"
+            return "out of reach" if not side else "out of reach, from another side"
         if start is not None:
             path = started_at(start, path, about)
             if not self.drive(path[0]):
@@ -190,7 +207,9 @@ class Replayer:
                 break
         if not session.success:
             return session.failure_reason.split(" [")[0]
-        return Demo(*(np.array(x) for x in zip(*rows, strict=True)), {"seed": seed, "spread_cm": spread_cm})
+        return Demo(
+            *(np.array(x) for x in zip(*rows, strict=True)), {"seed": seed, "spread_cm": spread_cm, "side": side}
+        )
 
     def drive(self, to: np.ndarray) -> bool:
         """Joint by joint in step, to rest there; whether the driver let it."""
@@ -217,6 +236,7 @@ class Try:
     spread_cm: float
     disturb: float
     start: np.ndarray | None
+    side: float
 
 
 _replayers: dict[str, Replayer] = {}
@@ -230,7 +250,8 @@ def attempt(one: Try) -> tuple[Try, Demo | str]:
     about = outline(one.demo, _replayers[task].arm)
     if about is None:
         return one, "nothing is moved in the recording"
-    return one, _replayers[task].replay(one.demo, about, one.seed, one.spread_cm, one.disturb, one.start)
+    side = one.side if (task, about.other) in ROUND else 0.0
+    return one, _replayers[task].replay(one.demo, about, one.seed, one.spread_cm, one.disturb, one.start, side)
 
 
 def make(data: Path, out: Path, number: int, spread_cm: float, disturb: float, seed: int, jobs: int, progress) -> dict:
@@ -259,12 +280,21 @@ def make(data: Path, out: Path, number: int, spread_cm: float, disturb: float, s
         # A source that cannot be replayed must not keep this going for ever.
         for task in sorted(by_task):
             rng = np.random.default_rng([seed, len(task), *task.encode()])
+            sides = np.random.default_rng([seed, 1, *task.encode()])
             for k in range(6 * wanted[task]):
                 if figures[task]["demos"] >= wanted[task]:
                     break
                 name, demo = by_task[task][k % len(by_task[task])]
                 spread = float(rng.uniform(MIN_SPREAD, spread_cm))
-                yield Try(name, demo, REPLAY_SEEDS + seed + k, spread, disturb, start(demo, rng))
+                yield Try(
+                    name,
+                    demo,
+                    REPLAY_SEEDS + seed + k,
+                    spread,
+                    disturb,
+                    start(demo, rng),
+                    ANOTHER_SIDE * sides.integers(-1, 2),
+                )
 
     with (
         DemoWriter(out, {**attrs, "task": "all", "replays_of": data.name}, 0.0) as writer,

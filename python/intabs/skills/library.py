@@ -193,7 +193,7 @@ def drawing(skill: Skill) -> str:
     from intabs import _core
 
     arm, size, views = _core.ArmModel.lite6(), 240, (("side", 0, 2), ("above", 0, 1))
-    lines = [arm_line(arm, f.q) for f in skill.frames]
+    lines = [arm.places(f.q) for f in skill.frames]
     objects = [f.object_pose[f.known, :3] for f in skill.frames]
     seen = np.concatenate([*lines, *objects])
     colours = ("#1f77b4", "#ff7f0e", "#2ca02c", "#d62728")
@@ -226,17 +226,3 @@ def drawing(skill: Skill) -> str:
         bar = 0.1 * scale
         out.append(f'<path d="M{3 * size - bar - 6:.1f} {16 + (row + 1) * size}h{bar:.1f}" stroke="#000"/>')
     return "\n".join([*out, "</svg>\n"])
-
-
-def arm_line(arm, q: np.ndarray) -> np.ndarray:
-    """Places of the joints and the tip in W, (8, 3)."""
-    X, line = np.eye(4), [np.zeros(3)]
-    for i, f in enumerate(np.asarray(arm.frames)):
-        L = np.eye(4)
-        L[:3, :3], L[:3, 3] = rotation(f).as_matrix(), f[:3]
-        X = X @ L
-        line.append(X[:3, 3].copy())
-        if i < 6:
-            c, s = np.cos(q[i]), np.sin(q[i])
-            X = X @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-    return np.array(line)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import time
+from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -25,6 +26,8 @@ MOVES = 0.04  # m (a turn counts TURN_LENGTH a radian): an object that comes so 
 CANDIDATES = 64  # verified, at most
 UNPRACTISED = 0.05  # m: what a chain that never did its task in practice counts as farther from the goal
 BROUGHT_WITHIN = 0.12  # m: an object that ends so near another one was brought to it
+CLEAR = 0.07  # m: an object that the arm's line passes so near is in the arm's way,
+IN_THE_WAY = 0.1  # m: and that counts as so much farther from the goal; leaving a task out counts more
 DONE = 0.03  # m (a turn counts TURN_LENGTH a radian): a wanted pose is reached
 
 
@@ -210,6 +213,7 @@ class Planner:
         self.library = Library.load(weights)
         self.effects = [Effect(chain) for chain in self.library.chains.values()]
         self.head = _core.KinematicRollout(str(weights), CANDIDATES)
+        self.arm = _core.ArmModel.lite6()
 
     def search(self, goals: list[Goal], seen: Frame) -> list[list[Effect]]:
         """The most promising sequences of chains, by their recordings; no longer than there are objects to be moved."""
@@ -223,7 +227,13 @@ class Planner:
         found = self._ranked(goals, seen, tidy or able)
         if not found:
             raise UserError("no demonstration moves what the goal names")
-        return found[:CANDIDATES]
+        # Rather many beginnings than one with all its continuations: what the arm meets is only seen in the head.
+        seen_before: Counter[int] = Counter()
+        turn = []
+        for sequence in found:
+            turn.append(seen_before[id(sequence[0])])
+            seen_before[id(sequence[0])] += 1
+        return [found[k] for k in sorted(range(len(found)), key=turn.__getitem__)[:CANDIDATES]]
 
     def _ranked(self, goals: list[Goal], seen: Frame, effects: list[Effect]) -> list[list[Effect]]:
         ranked = []
@@ -263,8 +273,13 @@ class Planner:
             [np.stack([s.z for s in p]) for p in plans], [[s.ticks for s in p] for p in plans],
         )  # fmt: skip
         left = [missing(goals, path)[0] for path in got["object_pose"]]
+        blocked = [
+            self._meets(sequence, seen, *way)
+            for sequence, *way in zip(candidates, got["q"], got["object_pose"], strict=True)
+        ]
         rates = [np.prod([self.library.rate(e.chain) for e in sequence]) for sequence in candidates]
-        best = int(np.argmin([x + UNPRACTISED * (1 - r) for x, r in zip(left, rates, strict=True)]))
+        cost = np.array(left) + UNPRACTISED * (1 - np.array(rates)) + IN_THE_WAY * np.array(blocked)
+        best = int(np.argmin(cost))
         return Plan(
             plans[best],
             ", ".join(f"{e.chain[0].task}: {e.chain[0].source}" for e in candidates[best]),
@@ -273,3 +288,16 @@ class Planner:
             searched - began,
             time.perf_counter() - searched,
         )
+
+    def _meets(self, sequence: list[Effect], seen: Frame, q: np.ndarray, object_pose: np.ndarray) -> bool:
+        """Whether the arm, at q (T, 6), comes on its way near an object that the chain it plays does not concern."""
+        at = 0
+        for e in sequence:
+            end = at + sum(s.ticks for s in e.chain)
+            for slot in np.flatnonzero(seen.known):
+                if slot not in e.concerns:
+                    distance = self.arm.distance_from(q[at:end], object_pose[at:end, slot, :3])
+                    if distance.min() < CLEAR:
+                        return True
+            at = end
+        return False

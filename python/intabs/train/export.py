@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 import shutil
 from collections.abc import Callable
@@ -17,6 +18,7 @@ import torch
 
 from intabs import _core
 from intabs.data.demos import OBJECT_SLOTS, Demo, load_demos
+from intabs.data.reader import DemoFile
 from intabs.errors import UserError
 from intabs.evaluate.learned import Learned
 from intabs.evaluate.metrics import fixed_cuts, sample
@@ -33,6 +35,7 @@ SEGMENT = 14  # ticks of a skill on which the formats are compared
 GOLDEN_TICKS = 40
 PRACTICE_CM, PRACTICE_SEED = 3.0, 500_000
 SURE = 3
+SAME_START = 0.05  # rad
 MORE = 4  # times as many tries where it is not clear which demonstration does best
 TOLERANCE = 1e-5
 
@@ -102,6 +105,34 @@ def unsure(chains: list[tuple[str, str]], won: list[int], tries: int) -> list[tu
     return out
 
 
+def other_sides(data: dict, recorded: dict[str, Demo]) -> list[tuple[str, str, Demo]]:
+    """(name, recording, replay): of the replays that a run learned from, for each recording and each other side of a
+    round object (replay/replay.py) the one that is most like it. data: of the checkpoint."""
+    path = data.get("replays_path", "")
+    if not path:
+        return []
+    if not Path(path).exists() or file_hash(path) != data["replays_sha256"]:
+        raise UserError(
+            f"{path}: not the replays of the training; skills are cut from those that come from other sides"
+        )
+    best: dict[tuple[str, float], tuple[tuple[bool, float], Demo]] = {}
+    with DemoFile(path) as f:
+        for k in range(len(f)):
+            attrs = f.own_attrs(k)
+            side = float(attrs.get("side", 0))
+            if not side or attrs["source"] not in recorded:
+                continue
+            replay, source = f.demo(k), str(attrs["source"])
+            elsewhere = np.abs(replay.joint_pos[0] - recorded[source].joint_pos[0]).max() > SAME_START
+            rank = bool(elsewhere), float(attrs["spread_cm"])
+            if (source, side) not in best or rank < best[source, side][0]:
+                best[source, side] = rank, replay
+    return [
+        (f"{n} {math.degrees(side):+.0f} deg", n, demo)
+        for (n, side), (_, demo) in sorted(best.items(), key=lambda x: x[0])
+    ]
+
+
 def export(
     run: Path | str,
     out: Path | str,
@@ -123,7 +154,8 @@ def export(
         raise UserError(f"{run}: was not trained on the Lite 6; only its weights run in C++")
     if model.space.layout != _core.STATE_LAYOUT:
         raise UserError(
-            f"{run}: sees objects as {model.space.layout}; C++ knows {_core.STATE_LAYOUT} (model.objects=gripper)"
+            f"{run}: sees objects as {model.space.layout}; C++ knows {_core.STATE_LAYOUT} (model.objects=gripper, "
+            "model.rotation=columns)"
         )
     out = Path(out).resolve()
     if out.exists() and not out.is_dir():
@@ -186,6 +218,10 @@ def _write(model: InteractionAbstractions, checkpoint: dict, out: Path, trials, 
     demos, names = load_named(checkpoint["data"]["path"], "train")
     config, cutter = checkpoint["config"], load_cutter(model, checkpoint.get("cutter"))
     cuts = [c.tolist() for c in Learned("intabs", model, config, cutter).cuts(demos, demos)]
+    for name, source, demo in other_sides(checkpoint["data"], dict(zip(names, demos, strict=True))):
+        cuts.append(cuts[names.index(source)])  # the same motion, tick by tick
+        names.append(name)
+        demos.append(demo)
     even = [fixed_cuts(len(d), SEGMENT + 1) for d in demos]
     if practice:
         tries = range(practice)

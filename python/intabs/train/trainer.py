@@ -108,11 +108,11 @@ def file_hash(path: Path | str) -> str:
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
-def load_space(demos: list[Demo], objects: str = "gripper") -> Space:
+def load_space(demos: list[Demo], objects: str = "gripper", rotation: str = "columns") -> Space:
     """Sizes as in these demonstrations; scales not yet fitted."""
     state, command = state_of(demos[0])
     arm = _core.ArmModel.lite6() if command is not None else None
-    return Space(state.agent.shape[-1], state.p.shape[-2], state.environment.shape[-1], arm, objects)
+    return Space(state.agent.shape[-1], state.p.shape[-2], state.environment.shape[-1], arm, objects, rotation)
 
 
 def load_named(path: Path | str, mask: str | None = None) -> tuple[list[Demo], list[str]]:
@@ -168,7 +168,7 @@ class Trainer:
         replayed = [d for d in replayed if d.attrs.get("source") in train_names]
         if self.replays and not replayed:
             raise UserError(f"{replays}: holds no replays of the demonstrations that {data} trains on")
-        space = load_space(train_demos, config["model"]["objects"])
+        space = load_space(train_demos, config["model"]["objects"], config["model"]["rotation"])
         space.fit([state_of(d) for d in train_demos + replayed])
         recorded = prepare(train_demos, space, train_names)
         self.scaling = Scaling.fit([motion_of(d.state) for d in recorded])
@@ -485,8 +485,9 @@ class Trainer:
                 "data": {
                     "path": str(self.data),
                     "sha256": file_hash(self.data),
+                    "replays_path": str(self.replays or ""),
                     "replays_sha256": file_hash(self.replays) if self.replays else "",
-                    "replays": sum(len(x) - 1 for x in {tuple(x) for x in self.sampler.same}),
+                    "replays": len(self.sampler.demonstrations) - len(self.recorded),
                 },
                 "code_version": __version__,
                 "seed": self.seed,

@@ -22,6 +22,7 @@ class Demonstration:
     state: State  # (T, ...)
     command: Tensor | None  # (T - 1, A) a^r in units of its scale; None: the agent's displacement is the command
     source: str = ""  # what it is a replay of, tick by tick; recordings have their own name
+    side: float = 0.0  # and from which other side of a round object (replay/replay.py) [rad]
 
 
 def prepare(demos: list[Demo], space: Space, names: list[str] | None = None) -> list[Demonstration]:
@@ -30,7 +31,7 @@ def prepare(demos: list[Demo], space: Space, names: list[str] | None = None) -> 
     for i, demo in enumerate(demos):
         state, command = state_of(demo)
         scaled = torch.from_numpy(command) / scale if command is not None else None
-        out.append(Demonstration(state, scaled, names[i] if names else ""))
+        out.append(Demonstration(state, scaled, names[i] if names else "", float(demo.attrs.get("side", 0))))
     return out
 
 
@@ -228,7 +229,8 @@ class WindowSampler:
         self.seen = [torch.nonzero(self.state.known[:, i])[:, 0].numpy() for i in range(space.slots)]
         self.used = np.array([(d.state.known > 0).any(0).numpy() for d in demonstrations])
         with_command = demonstrations[0].command is not None
-        names = np.array([d.source for d in demonstrations])
+        # The same motion, with the objects elsewhere.
+        names = np.array([f"{d.source} {d.side:.3f}" if d.source else "" for d in demonstrations])
         self.same = [np.flatnonzero(names == n) if n else np.array([i]) for i, n in enumerate(names)]
         # One row more a demonstration, so that states and commands share their index.
         self.command = (

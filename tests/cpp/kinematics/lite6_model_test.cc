@@ -119,6 +119,28 @@ std::vector<Golden> GoldenPoses() {
   };
 }
 
+TEST_CASE("The arm's line goes through the links of the MJCF, and distances are those from its part beyond the elbow") {
+  Mujoco mujoco;
+  const ArmModel arm = ArmModel::Lite6();
+  for (const Golden& golden : GoldenPoses()) {
+    INFO(golden.name);
+    mujoco.SetJoints(golden.q);
+    const ArmModel::Line line = arm.Places(golden.q);
+    for (int i = 0; i < kNumJoints; ++i) {
+      const int body = mujoco.Id(mjOBJ_BODY, ("link" + std::to_string(i + 1)).c_str());
+      CHECK((line[i + 1] - Eigen::Vector3d(mujoco.d().xpos + 3 * body)).norm() < 1e-6);
+    }
+    CHECK((line.back() - golden.p_BG).norm() < 1e-6);
+    for (const Eigen::Vector3d& p : {Eigen::Vector3d(0.2, 0.1, 0.1), Eigen::Vector3d(-0.1, 0.3, 0.5), line[5], line[2]}) {
+      double least = 1e9;
+      for (size_t i = 4; i < line.size(); ++i)
+        for (int k = 0; k <= 1000; ++k)
+          least = std::min(least, (line[i - 1] + 0.001 * k * (line[i] - line[i - 1]) - p).norm());
+      CHECK(arm.DistanceFrom(golden.q, p) == Approx(least).margin(2e-4));
+    }
+  }
+}
+
 TEST_CASE("The golden poses come out of the built-in arm, the URDF and the MJCF alike") {
   Mujoco mujoco;
   const ArmModel built_in = ArmModel::Lite6();
