@@ -27,6 +27,7 @@ Skill ReadSkill(const nlohmann::json& j) {
   Read(j.at("moved"), skill.record.moved.data(), kMaxObjects);
   const nlohmann::json& rested = j.at("rested");
   for (int i = 0; i < kMaxObjects; ++i) skill.record.rested[i] = rested.at(i).get<bool>();
+  skill.record.closed = j.at("frames").at(0).at("gripper_closed").get<bool>();
   return skill;
 }
 

@@ -10,7 +10,10 @@ namespace intabs {
 
 namespace {
 
-bool Rested(const SkillRecord& record) { return std::all_of(record.rested.begin(), record.rested.end(), std::identity{}); }
+// Nothing was moving or held as it began.
+bool Free(const SkillRecord& record) {
+  return !record.closed && std::all_of(record.rested.begin(), record.rested.end(), std::identity{});
+}
 
 }  // namespace
 
@@ -72,11 +75,11 @@ bool SkillPlayer::Missing(const SkillRecord& record, const Observation& observat
   return false;
 }
 
-// The first of the skills that led up to the object's motion: pi has learned to begin that one from anywhere, those closer
-// to the grasp only from beside the demonstration.
+// The first of the skills that led up to the object's motion, before it was grasped: pi has learned to begin that one from
+// anywhere, those closer to the grasp only from beside the demonstration.
 int SkillPlayer::RetryFrom(int skill) const noexcept {
-  while (skill > 0 && !Rested(skills_[skill].record)) --skill;
-  while (skill > 0 && Rested(skills_[skill - 1].record)) --skill;
+  while (skill > 0 && !Free(skills_[skill].record)) --skill;
+  while (skill > 0 && Free(skills_[skill - 1].record)) --skill;
   return skill;
 }
 

@@ -22,6 +22,7 @@ struct SkillRecord {
   // began; whether it did so as this one began.
   std::array<float, kMaxObjects> moved{};
   std::array<bool, kMaxObjects> rested{};
+  bool closed = false;  // the gripper was, as this one began
   SkillRecord() { rested.fill(true); }
 };
 

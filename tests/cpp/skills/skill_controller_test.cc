@@ -1,5 +1,6 @@
 #include "intabs/skills/skill_controller.h"
 
+#include <algorithm>
 #include <catch2/catch.hpp>
 #include <limits>
 #include <vector>
@@ -124,6 +125,24 @@ TEST_CASE("A skill whose object stays where it was is tried again from the first
   CHECK(controller.player().status().retries == kMaxRetries);
   CHECK(controller.player().status().end_reason == EndReason::kNoEffect);
   CHECK(command.mode == ArmMode::kHold);
+}
+
+TEST_CASE("What moves a second time in one grasp is tried again from before the grasp") {
+  SkillController controller = MakeController();
+  Readings r;
+  ArmCommand command;
+  std::vector<Skill> plan = PlanWithEffect();
+  plan[2].record.closed = plan[3].record.closed = plan[4].record.closed = true;
+  plan[3].record.rested[0] = false;  // pulled a little,
+  plan[4].record.rested[0] = true;   // let rest, pulled on
+  REQUIRE(controller.Start(1, plan) == Status::kOk);
+  int least = 4;
+  while (controller.player().playing()) {
+    r.Advance();
+    if (controller.Tick(r.status, r.poses, command) != Status::kOk) continue;
+    if (controller.player().status().retries == 1) least = std::min(least, controller.player().status().skill_index);
+  }
+  CHECK(least == 1);
 }
 
 TEST_CASE("An effect that happens, even late, and one that cannot be seen are no reason to try again") {
