@@ -442,6 +442,26 @@ def test_exported_weights_give_the_same_numbers_in_cpp(data, tmp_path):
     assert verify(out) > 5e-4
 
 
+def test_weights_of_16_bits_take_half_the_space_and_baselines_beside_weights_are_evaluated_with_them(data, tmp_path):
+    pytest.importorskip("safetensors")
+    from intabs.evaluate.evaluate import find_sources
+    from intabs.train.export import export, load_weights
+
+    train(data, tmp_path / "run")
+    sizes = {}
+    for bits, name in ((32, "weights"), (16, "weights-tvi")):
+        assert export(tmp_path / "run", tmp_path / name, trials=0, bits=bits)["max_abs_error"] < 1e-5
+        sizes[bits] = (tmp_path / name / "weights.safetensors").stat().st_size
+    assert sizes[16] < 0.6 * sizes[32]
+    exact, rounded = (load_weights(tmp_path / n)[0].pi.state_dict() for n in ("weights", "weights-tvi"))
+    largest = max(float((exact[k] - rounded[k]).abs().max()) for k in exact)
+    assert 0 < largest < 2e-3
+    assert find_sources([tmp_path / "weights"]) == [tmp_path / "weights", tmp_path / "weights-tvi"]
+    assert find_sources([tmp_path / "run"]) == [tmp_path / "run"]
+    with pytest.raises(UserError, match="write 16 or 32"):
+        export(tmp_path / "run", tmp_path / "other", trials=0, bits=8)
+
+
 def test_what_fails_while_exporting_leaves_the_weights_that_were_there(data, tmp_path, monkeypatch):
     pytest.importorskip("safetensors")
     import shutil

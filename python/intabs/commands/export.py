@@ -26,6 +26,7 @@ def register(app: typer.Typer) -> None:
             ),
         ] = 6,
         jobs: Annotated[int, typer.Option(help="Tries at a time.", min=1)] = 1,
+        bits: Annotated[int, typer.Option(help="Of a stored weight: 32, or 16 for half the space.")] = 32,
         json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
     ) -> None:
         """Write weights, manifest, golden vectors and the skill library; done when C++ loads them and agrees."""
@@ -34,7 +35,7 @@ def register(app: typer.Typer) -> None:
         except ModuleNotFoundError as e:
             raise UserError(f"{e.name} is not installed: run tools/setup (without --runtime-only)") from None
         with Progress("export", total=1.0) as progress:
-            figures = write(run, out, trials, practice, jobs, progress.update)
+            figures = write(run, out, trials, practice, jobs, progress.update, bits)
         write_json(json, figures)
         print(f"{out}: {figures['tensors']} tensors, C++ within {figures['max_abs_error']:.1e} of torch")
         for name, f in figures["formats"].items():

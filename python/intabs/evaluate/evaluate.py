@@ -44,18 +44,16 @@ def load_learned(source: Path) -> Learned:
 
 
 def find_sources(sources: list[Path]) -> list[Path]:
-    """Names of shipped weights stand for their folders; the baselines trained beside them come along."""
+    """Names of shipped weights stand for their folders; beside weights, the baselines' come along."""
     out = []
     for source in sources:
-        if source.exists():
-            out.append(source)
-            continue
-        folder = paths.MODELS / "weights" / source
+        folder = source if source.exists() else paths.MODELS / "weights" / source
         if not folder.exists():
             raise UserError(f"{source}: no run of `intabs train` and no folder in models/weights")
+        folder = folder.resolve()
         beside = (folder.with_name(f"{folder.name}-{kind}") for kind in ("tvi", "tvi-agent"))
-        out += [folder, *(f for f in beside if f.exists())]
-    return out
+        out += [folder, *(f for f in beside if (f / "manifest.json").exists())]
+    return list(dict.fromkeys(out))
 
 
 def evaluate(
@@ -70,8 +68,8 @@ def evaluate(
 
     {methods: {name: {all, balanced, joints, position, orientation, sd, n}}, knn, boundaries, ratios, seeds}: means
     over held-out demonstrations, or over all their segments; sd over seeds, of `all`; for the Lite 6 also FROM_TIP.
-    ratios: of the first method's
-    figures to the others', with 95 % intervals (bootstrap over held-out demonstrations, paired).
+    ratios: of the first method's figures to the others', with 95 % intervals (bootstrap over held-out demonstrations,
+    paired).
     """
     unknown = [m for m in methods or () if m not in METHODS]
     if unknown:

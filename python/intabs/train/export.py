@@ -31,6 +31,7 @@ from intabs.train.cutting import load_cutter
 from intabs.train.trainer import file_hash, load_model, load_named
 
 SCHEMA = 1
+STORED = {16: torch.float16, 32: torch.float32}
 SEGMENT = 14  # ticks of a skill on which the formats are compared
 GOLDEN_TICKS = 40
 PRACTICE_CM, PRACTICE_SEED = 8.0, 500_000  # so far that demonstrations differ in how well they do
@@ -140,9 +141,11 @@ def export(
     practice: int = 0,
     jobs: int = 1,
     progress: Callable[[float, str], None] = lambda share, text: None,
+    bits: int = 32,
 ) -> dict:
     """Returns {sha256, tensors, max_abs_error, formats}. `trials`: closed-loop runs of each weight format;
     `practice`: of each demonstration's skills, for the library to know which do their task; 0: none.
+    `bits`: 16 rounds the weights to half precision, in half the space; all that follows is theirs.
     Raises UserError if C++ and torch disagree by more than 1e-5. In `out` nothing changes until all is done."""
     model, checkpoint = load_model(run)
     data = checkpoint["data"]
@@ -157,6 +160,12 @@ def export(
             f"{run}: sees objects as {model.space.layout}; C++ knows {_core.STATE_LAYOUT} (model.objects=gripper, "
             "model.rotation=columns)"
         )
+    if bits not in STORED:
+        raise UserError(f"--bits {bits}: write 16 or 32")
+    if bits == 16:
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter.copy_(parameter.half())
     out = Path(out).resolve()
     if out.exists() and not out.is_dir():
         raise UserError(f"--out {out}: is a file; name a folder")
@@ -164,7 +173,7 @@ def export(
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
-        figures = _write(model, checkpoint, partial, trials, practice, jobs, progress)
+        figures = _write(model, checkpoint, partial, trials, practice, jobs, progress, STORED[bits])
         out.mkdir(exist_ok=True)
         for file in sorted(partial.iterdir()):
             os.replace(file, out / file.name)
@@ -173,11 +182,13 @@ def export(
     return figures
 
 
-def _write(model: InteractionAbstractions, checkpoint: dict, out: Path, trials, practice, jobs, progress) -> dict:
+def _write(
+    model: InteractionAbstractions, checkpoint: dict, out: Path, trials, practice, jobs, progress, stored: torch.dtype
+) -> dict:
     from safetensors.torch import save_file
 
     tensors = {
-        f"{net}.{name}": value.float()
+        f"{net}.{name}": value.to(stored)
         for net, module in model.networks().items()
         for name, value in module.tensors().items()
     }
