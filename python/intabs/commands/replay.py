@@ -18,6 +18,9 @@ def register(app: typer.Typer) -> None:
         number: Annotated[int, typer.Option(help="Replays that succeed, spread over the tasks.", min=1)] = 500,
         spread: Annotated[float, typer.Option(help="Objects are moved by up to so many cm.", min=1.0)] = 10.0,
         disturb: Annotated[float, typer.Option(help="Pushes that the commands get and take back [rad].", min=0)] = 0.01,
+        sides: Annotated[
+            bool, typer.Option("--sides", help="Pour into the bowl from other sides than the recordings, too.")
+        ] = False,
         seed: Annotated[int, typer.Option(min=0)] = 0,
         jobs: Annotated[int, typer.Option(help="Tries at a time.", min=1)] = 1,
         json: Annotated[Path | None, typer.Option(help="Write the figures there.")] = None,
@@ -26,7 +29,7 @@ def register(app: typer.Typer) -> None:
         from intabs.replay.replay import make
 
         with Progress("replay", total=number) as progress:
-            figures = make(data, out, number, spread, disturb, seed, jobs, progress.update)
+            figures = make(data, out, number, spread, disturb, seed, jobs, progress.update, sides)
         write_json(json, figures)
         print(f"{out}: {figures['demos']} replays, {figures['frames']} frames, of {figures['tries']} tries")
         for task, f in figures["tasks"].items():

@@ -3,9 +3,9 @@ tried in the plant. From a recording alone: its commands and what was seen; noth
 
 The tip's commanded path X(t) becomes D(t) X(t). D moves along with what the motion is about: not at all at the start,
 then with the object that will be moved (its displacement D_i), then, as it comes near another object, with that one's
-(D_j). Inverse kinematics gives the new commands. To what is round, a bowl, things may come from another side: some
-replays turn the way there and back about its axis. After Mandlekar et al., MimicGen (2023), with references that go
-over into each other instead of cut pieces.
+(D_j). Inverse kinematics gives the new commands. To what is round, a bowl, things may come from another side: if asked
+for, some replays turn the way there and back about its axis. After Mandlekar et al., MimicGen (2023), with references
+that go over into each other instead of cut pieces.
 """
 
 from __future__ import annotations
@@ -254,8 +254,19 @@ def attempt(one: Try) -> tuple[Try, Demo | str]:
     return one, _replayers[task].replay(one.demo, about, one.seed, one.spread_cm, one.disturb, one.start, side)
 
 
-def make(data: Path, out: Path, number: int, spread_cm: float, disturb: float, seed: int, jobs: int, progress) -> dict:
+def make(
+    data: Path,
+    out: Path,
+    number: int,
+    spread_cm: float,
+    disturb: float,
+    seed: int,
+    jobs: int,
+    progress,
+    sides: bool = False,
+) -> dict:
     """Replays of the training split's demonstrations: `number` that succeeded, as many of each task as of others.
+    sides: two thirds of the tries come to what is ROUND from another side.
     {demos, frames, tries, tasks: {task: {demos, tries, failures: {reason: n}}}}."""
     from intabs.data.reader import DemoFile
 
@@ -280,21 +291,14 @@ def make(data: Path, out: Path, number: int, spread_cm: float, disturb: float, s
         # A source that cannot be replayed must not keep this going for ever.
         for task in sorted(by_task):
             rng = np.random.default_rng([seed, len(task), *task.encode()])
-            sides = np.random.default_rng([seed, 1, *task.encode()])
+            sided = np.random.default_rng([seed, 1, *task.encode()])
             for k in range(6 * wanted[task]):
                 if figures[task]["demos"] >= wanted[task]:
                     break
                 name, demo = by_task[task][k % len(by_task[task])]
                 spread = float(rng.uniform(MIN_SPREAD, spread_cm))
-                yield Try(
-                    name,
-                    demo,
-                    REPLAY_SEEDS + seed + k,
-                    spread,
-                    disturb,
-                    start(demo, rng),
-                    ANOTHER_SIDE * sides.integers(-1, 2),
-                )
+                side = ANOTHER_SIDE * sided.integers(-1, 2) if sides else 0.0
+                yield Try(name, demo, REPLAY_SEEDS + seed + k, spread, disturb, start(demo, rng), side)
 
     with (
         DemoWriter(out, {**attrs, "task": "all", "replays_of": data.name}, 0.0) as writer,

@@ -28,6 +28,7 @@ UNPRACTISED = 0.05  # m: what a chain that never did its task in practice counts
 BROUGHT_WITHIN = 0.12  # m: an object that ends so near another one was brought to it
 CLEAR = 0.07  # m: an object that the arm's line passes so near is in the arm's way,
 IN_THE_WAY = 0.1  # m: and that counts as so much farther from the goal; leaving a task out counts more
+POURED_WITHIN = 0.16  # m: an object turned so near another one is poured into it
 DONE = 0.03  # m (a turn counts TURN_LENGTH a radian): a wanted pose is reached
 
 
@@ -39,9 +40,14 @@ class Goal:
     pose: np.ndarray  # (7,) p_WO, q_WO
     position: bool = True  # what counts of it
     turn: bool = True
+    # x, y of a vertical axis: turned about it the pose is as good. Into a bowl one pours from any side.
+    axis: np.ndarray | None = None
 
     def missing(self, pose: np.ndarray) -> np.ndarray:
         """How far poses (..., 7) are from it [m]."""
+        if self.axis is not None:
+            (r, z, lean), (mine, height, leaning) = (self._about(x) for x in (pose, self.pose))
+            return np.hypot(r - mine, z - height) + TURN_LENGTH * np.abs(lean - leaning)
         out = np.zeros(pose.shape[:-1])
         if self.position:
             out = out + np.linalg.norm(pose[..., :3] - self.pose[:3], axis=-1)
@@ -49,6 +55,11 @@ class Goal:
             angle = (rotation(self.pose).inv() * rotation(pose.reshape(-1, 7))).magnitude()
             out = out + TURN_LENGTH * angle.reshape(out.shape)
         return out
+
+    def _about(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distance from the axis [m], height [m], angle of its z from the vertical [rad], of poses (..., 7)."""
+        up = rotation(pose.reshape(-1, 7)).apply([0, 0, 1])[:, 2].reshape(pose.shape[:-1])
+        return np.linalg.norm(pose[..., :2] - self.axis, axis=-1), pose[..., 2], np.arccos(np.clip(up, -1, 1))
 
 
 @dataclass
@@ -179,10 +190,22 @@ def goals_of(library: Library, task: str, seen: Frame) -> list[Goal]:
             far = TURN_LENGTH * _turns(path[:, i])
             k = int(np.argmax(far))
             if far[k] - far[-1] > 0.05:  # turned and turned back: poured
-                out.append(Goal(i, path[k, i]))
+                out.append(_poured(effect, i, k, pose, path[k, i]))
             out.append(Goal(i, path[-1, i]))
         pose = path[-1]
     return out
+
+
+def _poured(effect: Effect, i: int, k: int, now: np.ndarray, pose: np.ndarray) -> Goal:
+    """Object i as it is in frame k of the recording, told from what it is poured into; `pose`: if that is nothing."""
+    then = effect.path[k]
+    resting = [j for j in range(SLOTS) if effect.first.known[j] and j not in effect.moved]
+    into = min(resting, key=lambda j: np.linalg.norm(then[i, :3] - then[j, :3]), default=None)
+    if into is None or np.linalg.norm(then[i, :3] - then[into, :3]) > POURED_WITHIN:
+        return Goal(i, pose)
+    R = Rotation.from_rotvec([0, 0, (rotation(now[into]) * rotation(then[into]).inv()).as_rotvec()[2]])
+    p = now[into, :3] + R.apply(then[i, :3] - then[into, :3])
+    return Goal(i, np.concatenate([p, np.roll((R * rotation(then[i])).as_quat(), 1)]), axis=now[into, :2].copy())
 
 
 def load_goals(path: Path) -> list[Goal]:
