@@ -6,15 +6,24 @@ from test_learning import record
 
 pytest.importorskip("torch")
 
-from intabs import (
-    _core,  # noqa: E402
-    paths,  # noqa: E402
-)
+from intabs import _core, paths  # noqa: E402
 from intabs.data.demos import load_demos, save_demos  # noqa: E402
 from intabs.data.reader import DemoFile  # noqa: E402
 from intabs.errors import UserError  # noqa: E402
 from intabs.model.space import state_of  # noqa: E402
-from intabs.replay.replay import ANOTHER_SIDE, Replayer, Try, attempt, displacement, make, outline, pad_slots  # noqa: E402
+from intabs.replay import replay as module  # noqa: E402
+from intabs.replay.replay import (  # noqa: E402
+    ANOTHER_SIDE,
+    MAX_STEP,
+    SLOW,
+    Replayer,
+    Try,
+    displacement,
+    make,
+    outline,
+    pad_slots,
+    started_at,
+)
 
 
 @pytest.fixture(scope="module")
@@ -78,8 +87,8 @@ def test_a_bowl_may_be_come_to_from_another_side(poured):
     np.testing.assert_allclose(tip[0][-1, :3], tip[1][-1, :3], atol=0.02)  # and set down where it was
 
 
-def test_replays_from_other_sides_succeed_and_a_library_takes_the_one_most_like_its_recording(poured, tmp_path):
-    from intabs.train.export import other_sides
+def test_replays_from_another_side_succeed_and_a_library_takes_the_one_most_like_its_recording(poured, tmp_path):
+    from intabs.train.export import variants
     from intabs.train.trainer import file_hash, load_space
     from intabs.train.windows import WindowSampler, prepare
 
@@ -88,24 +97,44 @@ def test_replays_from_other_sides_succeed_and_a_library_takes_the_one_most_like_
     (name,) = DemoFile(data).names
     replays = []
     for seed, side in ((7, 0.0), (8, ANOTHER_SIDE)):
-        _, replay = attempt(Try(name, poured[1][1], seed, 0.5, 0.0, None, side))
+        _, replay = module.attempt(Try(name, poured[1][1], seed, 0.5, 0.0, None, side))
         assert replay.attrs["side"] == side
         replay.attrs |= {"task": "pour", "source": name}
         replays.append(replay)
     save_demos(out, replays, {"embodiment": "lite6", "rate_hz": 25.0}, valid_share=0.0)
     recorded = {name: load_demos(data)[0][0]}
     made = {"replays_path": str(out), "replays_sha256": file_hash(out)}
-    found = other_sides(made, recorded)
+    found = variants(made, recorded)
     assert [x[:2] for x in found] == [(f"{name} {np.degrees(ANOTHER_SIDE):+.0f} deg", name)]
     assert len(found[0][2]) == len(recorded[name])
-    assert other_sides({}, recorded) == []
+    assert variants({}, recorded) == []
     with pytest.raises(UserError, match="not the replays of the training"):
-        other_sides(made | {"replays_sha256": ""}, recorded)
+        variants(made | {"replays_sha256": ""}, recorded)
     # What the encoders are shown of another replay is the same motion.
     space = load_space(replays, "gripper")
     space.fit([state_of(d) for d in replays])
     three = prepare([*replays, replays[0]], space, [name] * 3)
     assert [x.tolist() for x in WindowSampler(three, space, 20, (8, 20)).same] == [[0, 2], [1], [0, 2]]
+
+
+def test_a_start_too_far_for_the_recordings_pace_makes_the_way_there_longer(demo):
+    replayer = Replayer("pick_place")
+    about = outline(demo, replayer.arm)
+    slow = module.slowed(about, SLOW)
+    n = about.approach
+    assert len(slow.gripper) == len(about.gripper) + SLOW and slow.approach == n
+    at = module.in_replay(np.arange(len(demo)), {"slow": SLOW, "approach": n})
+    assert at[0] == 0 and (np.diff(at) >= 1).all() and at[-1] == len(demo) - 1 + SLOW
+    np.testing.assert_array_equal(module.in_replay(np.arange(9), {}), np.arange(9))
+    np.testing.assert_allclose(slow.q_target[at], about.q_target, atol=0.03)
+    np.testing.assert_array_equal(slow.gripper[at[n:]], about.gripper[n:])
+    # Where a pour ends: joint 4 by half a turn away.
+    far = about.q_target[0] + [0.3, 0.3, -0.3, -3.0, 0.5, 0.0]
+    assert started_at(far, about.q_target, about, (1.0,)) is None
+    path = started_at(far, slow.q_target, slow, (1.0,))
+    assert np.abs(np.diff(path, axis=0)).max() <= MAX_STEP
+    np.testing.assert_allclose(path[0], far)
+    np.testing.assert_allclose(path[at[n + 5] :], slow.q_target[at[n + 5] :])
 
 
 def test_a_turn_in_the_plane_is_measured():
@@ -120,11 +149,15 @@ def test_replays_succeed_with_the_objects_elsewhere_and_keep_their_recordings_ti
     save_demos(data, [record(s) for s in (0, 1)], {"embodiment": "lite6", "rate_hz": 25.0}, valid_share=0.0)
     figures = make(data, out, 6, 5.0, 0.006, 0, 1, lambda *_: None)
     assert figures["demos"] == 6 and figures["tries"] <= 9
+    with pytest.raises(UserError, match="--of nosuch"):
+        make(data, out, 6, 5.0, 0.006, 0, 1, lambda *_: None, of={"nosuch": 1})
+    with pytest.raises(UserError, match="--number 2: --of says 3"):
+        make(data, out, 2, 5.0, 0.006, 0, 1, lambda *_: None, of={"pick_place": 3})
     recorded = dict(zip(DemoFile(data).names, load_demos(data)[0], strict=True))
     replays, _ = load_demos(out)
     for d in replays:
         source = recorded[d.attrs["source"]]
-        assert len(d) == len(source)
+        assert len(d) == len(source) + d.attrs["slow"] and d.attrs["slow"] in (0, SLOW)
         moved = np.linalg.norm(d.object_pose[0, :2, :2] - source.object_pose[0, :2, :2], axis=-1)
         assert moved.max() > 2e-3
         # Actions say how to go on from where the arm was told to be.

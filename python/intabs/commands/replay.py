@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from intabs.errors import UserError
 from intabs.output import Progress, write_json
 
 
@@ -16,6 +17,9 @@ def register(app: typer.Typer) -> None:
         data: Annotated[Path, typer.Option(help="Recorded demonstrations of the Lite 6, HDF5; those of mask/train.")],
         out: Annotated[Path, typer.Option(help="HDF5 to write.")],
         number: Annotated[int, typer.Option(help="Replays that succeed, spread over the tasks.", min=1)] = 500,
+        of: Annotated[
+            list[str] | None, typer.Option(help="TASK=N: so many of them are of this task; again for more.")
+        ] = None,
         spread: Annotated[float, typer.Option(help="Objects are moved by up to so many cm.", min=1.0)] = 10.0,
         disturb: Annotated[float, typer.Option(help="Pushes that the commands get and take back [rad].", min=0)] = 0.01,
         sides: Annotated[
@@ -28,8 +32,14 @@ def register(app: typer.Typer) -> None:
         """Replay demonstrations in the plant with objects elsewhere; what succeeds is kept, for `train --replays`."""
         from intabs.replay.replay import make
 
+        tasks = {}
+        for item in of or []:
+            task, _, n = item.partition("=")
+            if not n.isdigit():
+                raise UserError(f"--of {item}: write TASK=N")
+            tasks[task] = int(n)
         with Progress("replay", total=number) as progress:
-            figures = make(data, out, number, spread, disturb, seed, jobs, progress.update, sides)
+            figures = make(data, out, number, spread, disturb, seed, jobs, progress.update, sides, tasks)
         write_json(json, figures)
         print(f"{out}: {figures['demos']} replays, {figures['frames']} frames, of {figures['tries']} tries")
         for task, f in figures["tasks"].items():

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +21,10 @@ from scipy.spatial.transform import Rotation
 
 from intabs import _core, paths
 from intabs.data.demos import OBJECT_SLOTS, Demo, DemoWriter
+from intabs.errors import UserError
 from intabs.jobs import in_processes
 
+REACHED = 0.9  # of to_mover: the way to the object is over
 NEAR_GRASP = 0.08  # m, tip from the place where the object begins to move: there D is D_i
 NEAR_GOAL = 0.10  # m, moved object from the other one: there D is D_j
 SMOOTH = 4.0  # ticks, of D's weights
@@ -35,6 +37,7 @@ REPLAY_SEEDS = 300000  # of the plant; evaluation uses others
 MAX_STEP = 0.08  # rad a tick (2 rad/s): a path that is faster is not tried
 ELSEWHERE = 0.5  # share of the replays that do not start at home: half of them where another demonstration ended,
 START_RAD = 0.15  # half of them so far from home (standard deviation, each joint)
+SLOW = 40  # ticks more on the way to the object where a start is too far for the recording's pace
 DRIVE_STEP = 0.03  # rad a tick, on the way to such a start
 ROUND = {("pour", 1)}  # task, slot: objects that things may come to from any side,
 ANOTHER_SIDE = 1.1  # rad: about their axis by so much, in a third of the tries each way
@@ -52,6 +55,7 @@ class Outline:
     to_mover: np.ndarray  # (T,) 0 .. 1
     to_other: np.ndarray  # (T,) 0 .. 1
     at_other: np.ndarray  # (T,) 0 .. 1, and back
+    approach: int  # ticks of the recording's way to the object
 
 
 def outline(demo: Demo, arm) -> Outline | None:
@@ -91,7 +95,8 @@ def outline(demo: Demo, arm) -> Outline | None:
         to_other = _progress(distance[k], NEAR_GOAL)
         to_other[:began] = 0
         at_other = _progress(distance[k], NEAR_ROUND, back=True)
-    return Outline(target, demo.actions[:, 6] > 0, mover, other, to_mover, to_other, at_other)
+    return Outline(target, demo.actions[:, 6] > 0, mover, other, to_mover, to_other, at_other,
+                   max(1, int(np.argmax(to_mover >= REACHED))))  # fmt: skip
 
 
 def _progress(distance: np.ndarray, near: float, back: bool = False) -> np.ndarray:
@@ -103,16 +108,39 @@ def _progress(distance: np.ndarray, near: float, back: bool = False) -> np.ndarr
     return np.clip(gaussian_filter1d(w, SMOOTH), 0, 1)
 
 
-def started_at(start: np.ndarray, path: np.ndarray, about: Outline) -> np.ndarray:
-    """Joint targets (T, 6) that begin at `start`, or as far towards it as MAX_STEP allows, and join `path` on the
-    way to the object that will be moved."""
-    x = np.clip(about.to_mover / 0.8, 0, 1)[:, None]
-    offset = (1 - x * x * (3 - 2 * x)) * (start - path[0])
-    for share in (1.0, 0.75, 0.5, 0.25):
+def slowed(about: Outline, ticks: int) -> Outline:
+    """The way to the object lasts so many ticks more."""
+    end, n = about.approach, len(about.gripper)
+    t = np.concatenate([np.arange(end + ticks) * end / (end + ticks), np.arange(end, n)])
+
+    def along(x: np.ndarray) -> np.ndarray:
+        if x.dtype == bool:
+            return x[np.round(t).astype(int)]
+        return np.stack([np.interp(t, np.arange(n), c) for c in x.reshape(n, -1).T], -1).reshape(len(t), *x.shape[1:])
+
+    arrays = {k: along(v) for k, v in vars(about).items() if isinstance(v, np.ndarray)}
+    return replace(about, **arrays)
+
+
+def in_replay(ticks: np.ndarray, attrs: dict) -> np.ndarray:
+    """Where ticks of a recording are in a replay of it with these attributes."""
+    slow, end = int(attrs.get("slow", 0)), int(attrs.get("approach", 1))
+    return np.where(ticks < end, np.round(ticks * (end + slow) / end), ticks + slow).astype(int)
+
+
+def started_at(start: np.ndarray, path: np.ndarray, about: Outline, shares: tuple[float, ...]) -> np.ndarray | None:
+    """Joint targets (T, 6) that begin at `start`, or at the first of these shares of the way to it that MAX_STEP
+    allows, and join `path` on the way to the object that will be moved; None if it allows none."""
+    end = int(np.argmax(about.to_mover >= REACHED))
+    x = np.clip(np.arange(len(path)) / max(end, 1), 0, 1)
+    # Speed goes up and down in a fifth of the time each.
+    done = np.where(x < 0.2, x * x / 0.32, np.where(x > 0.8, 1 - (1 - x) ** 2 / 0.32, (x - 0.1) / 0.8))
+    offset = (1 - done)[:, None] * (start - path[0])
+    for share in shares:
         moved = path + share * offset
         if np.abs(np.diff(moved, axis=0)).max() <= MAX_STEP:
             return moved
-    return path
+    return None
 
 
 def displacement(old: np.ndarray, new: np.ndarray) -> tuple[np.ndarray, float]:
@@ -184,10 +212,16 @@ class Replayer:
         path = self.commands(demo, about, session.observe()["object_pose"], side)
         if path is None:
             return "out of reach" if not side else "out of reach, from another side"
+        slow = 0
         if start is not None:
-            path = started_at(start, path, about)
-            if not self.drive(path[0]):
+            far = started_at(start, path, about, (1.0,))
+            if far is None:
+                slow, about = SLOW, slowed(about, SLOW)
+                path = self.commands(demo, about, session.observe()["object_pose"], side)
+                far = started_at(start, path, about, (1.0, 0.75, 0.5, 0.25, 0.0)) if path is not None else None
+            if far is None or not self.drive(far[0]):
                 return "start out of reach"
+            path = far
         rows, pushed, target = [], np.zeros(6), path[0].copy()
         for t, wanted in enumerate(path):
             o = session.observe()
@@ -207,9 +241,8 @@ class Replayer:
                 break
         if not session.success:
             return session.failure_reason.split(" [")[0]
-        return Demo(
-            *(np.array(x) for x in zip(*rows, strict=True)), {"seed": seed, "spread_cm": spread_cm, "side": side}
-        )
+        how = {"seed": seed, "spread_cm": spread_cm, "side": side, "slow": slow, "approach": about.approach}
+        return Demo(*(np.array(x) for x in zip(*rows, strict=True)), how)
 
     def drive(self, to: np.ndarray) -> bool:
         """Joint by joint in step, to rest there; whether the driver let it."""
@@ -264,8 +297,10 @@ def make(
     jobs: int,
     progress,
     sides: bool = False,
+    of: dict[str, int] | None = None,
 ) -> dict:
-    """Replays of the training split's demonstrations: `number` that succeeded, as many of each task as of others.
+    """Replays of the training split's demonstrations: `number` that succeeded, as many of each task as of others
+    but those of which `of` says how many.
     sides: two thirds of the tries come to what is ROUND from another side.
     {demos, frames, tries, tasks: {task: {demos, tries, failures: {reason: n}}}}."""
     from intabs.data.reader import DemoFile
@@ -276,7 +311,14 @@ def make(
     by_task: dict[str, list] = {}
     for name, demo in recorded:
         by_task.setdefault(str(demo.attrs["task"]), []).append((name, demo))
-    wanted = {task: number // len(by_task) + (i < number % len(by_task)) for i, task in enumerate(sorted(by_task))}
+    of = of or {}
+    if unknown := set(of) - set(by_task):
+        raise UserError(f"--of {min(unknown)}: {data} has {', '.join(sorted(by_task))}")
+    others = [task for task in sorted(by_task) if task not in of]
+    rest = number - sum(of.values())
+    if rest < 0 or (rest and not others):
+        raise UserError(f"--number {number}: --of says {sum(of.values())} replays")
+    wanted = of | {task: rest // len(others) + (i < rest % len(others)) for i, task in enumerate(others)}
     figures = {task: {"demos": 0, "tries": 0, "failures": Counter()} for task in wanted}
     frames = done = 0
     ends = np.array([demo.joint_pos[-1] for _, demo in recorded])

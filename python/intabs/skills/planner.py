@@ -106,14 +106,15 @@ def whole(library: Library, task: str, seen: Frame | None, source: str = "") -> 
 
 
 def _apart(chain: list[Skill], seen: Frame) -> float:
-    """How differently the objects of a chain lay as it began [m]."""
+    """How differently the objects of a chain lay as it began, and the arm stood (TURN_LENGTH a radian) [m]."""
     first = chain[0].frames[0]
     both = np.flatnonzero(first.known & seen.known)
     if len(both) < first.known.sum():
         return float("inf") if not len(both) else 1e3 + len(both)
     a, b = first.object_pose[both], seen.object_pose[both]
     turn = (rotation(a).inv() * rotation(b)).magnitude()
-    return float((np.linalg.norm(a[:, :3] - b[:, :3], axis=1) + TURN_LENGTH * turn).sum())
+    arm = TURN_LENGTH * np.abs(first.q - seen.q).max()
+    return float((np.linalg.norm(a[:, :3] - b[:, :3], axis=1) + TURN_LENGTH * turn).sum() + arm)
 
 
 # --- what chains do ---------------------------------------------------------------------------------------------------
@@ -274,7 +275,9 @@ class Planner:
                     continue
                 path = first[id(a)]
                 more = b.on(path[-1])
-                apart = _apart(a.chain, seen) + _apart(b.chain, replace(seen, object_pose=path[-1]))
+                apart = _apart(a.chain, seen) + _apart(
+                    b.chain, replace(seen, q=a.chain[-1].frames[-1].q, object_pose=path[-1])
+                )
                 ranked.append((missing(goals, np.concatenate([path, more]))[0], apart, [a, b]))
         # Recordings that do as well as each other: rather the one that began as things are now.
         worth = {id(e): self.library.rate(e.chain) for e in effects}

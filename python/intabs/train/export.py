@@ -25,6 +25,7 @@ from intabs.evaluate.metrics import fixed_cuts, sample
 from intabs.jobs import in_processes
 from intabs.model.networks import InteractionAbstractions, phase, phase_basis
 from intabs.model.space import Space, state_of
+from intabs.replay.replay import in_replay
 from intabs.rollout import UNSEEN, Setting, run_trial
 from intabs.skills.library import Library, entries
 from intabs.train.cutting import load_cutter
@@ -37,6 +38,7 @@ GOLDEN_TICKS = 40
 PRACTICE_CM, PRACTICE_SEED = (3.0, 8.0), 500_000  # by turns: far away demonstrations differ in how well they do
 SURE = 3
 SAME_START = 0.05  # rad
+AFAR = " from afar"  # of a demonstration whose start is far away, where no practice begins
 MORE = 2  # times as many tries where it is not clear which demonstration does best
 TOLERANCE = 1e-5
 
@@ -86,12 +88,15 @@ def practise(
     turns, seeds of its own. only: of these (task, demonstration)."""
     write_library(out, library)
     chains = list(Library.load(out).chains)
+    only = [c for c in only or chains if not c[1].endswith(AFAR)]
     work = [(Setting(task, str(out), PRACTICE_CM[i % 2], "truth", PRACTICE_SEED, "", source=source), i)
-            for task, source in sorted(only or chains) for i in tries]  # fmt: skip
+            for task, source in sorted(only) for i in tries]  # fmt: skip
     won = dict.fromkeys(chains, 0)
     for done, ((setting, _), result) in enumerate(zip(work, in_processes(run_trial, work, jobs), strict=True)):
         won[setting.task, setting.source] += result["success"]
         progress(done / len(work), f"{setting.task}: {setting.source}")
+    for task, source in chains:  # as good as from near
+        won[task, source] = won.get((task, source.removesuffix(AFAR)), 0)
     return list(won.values())
 
 
@@ -106,32 +111,32 @@ def unsure(chains: list[tuple[str, str]], won: list[int], tries: int) -> list[tu
     return out
 
 
-def other_sides(data: dict, recorded: dict[str, Demo]) -> list[tuple[str, str, Demo]]:
-    """(name, recording, replay): of the replays that a run learned from, for each recording and each other side of a
-    round object (replay/replay.py) the one that is most like it. data: of the checkpoint."""
+def variants(data: dict, recorded: dict[str, Demo]) -> list[tuple[str, str, Demo]]:
+    """(name, recording, replay): of the replays that a run learned from, for each recording and each other way to do it
+    (from another side of a round object, from a start far away: replay/replay.py) the one most like it. data: of the
+    checkpoint."""
     path = data.get("replays_path", "")
     if not path:
         return []
     if not Path(path).exists() or file_hash(path) != data["replays_sha256"]:
-        raise UserError(
-            f"{path}: not the replays of the training; skills are cut from those that come from other sides"
-        )
-    best: dict[tuple[str, float], tuple[tuple[bool, float], Demo]] = {}
+        raise UserError(f"{path}: not the replays of the training; skills are cut from those that go another way")
+    best: dict[tuple[str, float, int], tuple[tuple[bool, float], Demo]] = {}
     with DemoFile(path) as f:
         for k in range(len(f)):
             attrs = f.own_attrs(k)
-            side = float(attrs.get("side", 0))
-            if not side or attrs["source"] not in recorded:
+            way = str(attrs["source"]), float(attrs.get("side", 0)), int(attrs.get("slow", 0))
+            if way[1:] == (0, 0) or way[0] not in recorded:
                 continue
-            replay, source = f.demo(k), str(attrs["source"])
-            elsewhere = np.abs(replay.joint_pos[0] - recorded[source].joint_pos[0]).max() > SAME_START
-            rank = bool(elsewhere), float(attrs["spread_cm"])
-            if (source, side) not in best or rank < best[source, side][0]:
-                best[source, side] = rank, replay
-    return [
-        (f"{n} {math.degrees(side):+.0f} deg", n, demo)
-        for (n, side), (_, demo) in sorted(best.items(), key=lambda x: x[0])
-    ]
+            replay = f.demo(k)
+            elsewhere = np.abs(replay.joint_pos[0] - recorded[way[0]].joint_pos[0]).max() > SAME_START
+            rank = bool(elsewhere) and not way[2], float(attrs["spread_cm"])
+            if way not in best or rank < best[way][0]:
+                best[way] = rank, replay
+    out = []
+    for (source, side, slow), (_, demo) in sorted(best.items(), key=lambda x: x[0]):
+        how = f" {math.degrees(side):+.0f} deg" * bool(side) + AFAR * bool(slow)
+        out.append((source + how, source, demo))
+    return out
 
 
 def export(
@@ -229,8 +234,8 @@ def _write(
     demos, names = load_named(checkpoint["data"]["path"], "train")
     config, cutter = checkpoint["config"], load_cutter(model, checkpoint.get("cutter"))
     cuts = [c.tolist() for c in Learned("intabs", model, config, cutter).cuts(demos, demos)]
-    for name, source, demo in other_sides(checkpoint["data"], dict(zip(names, demos, strict=True))):
-        cuts.append(cuts[names.index(source)])  # the same motion, tick by tick
+    for name, source, demo in variants(checkpoint["data"], dict(zip(names, demos, strict=True))):
+        cuts.append(in_replay(np.array(cuts[names.index(source)]), demo.attrs).tolist())
         names.append(name)
         demos.append(demo)
     even = [fixed_cuts(len(d), SEGMENT + 1) for d in demos]

@@ -219,7 +219,7 @@ class Trainer:
 
     def _use_cuts(self) -> None:
         if self.found:
-            self.joint_sampler.cuts = [np.array(self.found[d.source]) for d in self.joint_sampler.demonstrations]
+            self.joint_sampler.cuts = [d.at(self.found[d.source]) for d in self.joint_sampler.demonstrations]
 
     def _encode(self, batch: Windows) -> tuple[torch.Tensor, torch.Tensor]:
         """Mean and log of the standard deviation of z (M, 16) of what the batch shows."""

@@ -15,6 +15,7 @@ from intabs.data.demos import Demo
 from intabs.errors import UserError
 from intabs.model import kinematics
 from intabs.model.space import Space, State, state_of
+from intabs.replay.replay import in_replay
 
 
 @dataclass
@@ -22,7 +23,16 @@ class Demonstration:
     state: State  # (T, ...)
     command: Tensor | None  # (T - 1, A) a^r in units of its scale; None: the agent's displacement is the command
     source: str = ""  # what it is a replay of, tick by tick; recordings have their own name
-    side: float = 0.0  # and from which other side of a round object (replay/replay.py) [rad]
+    about: dict = field(default_factory=dict)  # and how: side, slow, approach (replay/replay.py)
+
+    def at(self, cuts: list[int]) -> np.ndarray:
+        """Where the skills of its recording begin in it."""
+        return in_replay(np.array(cuts), self.about)
+
+    @property
+    def motion(self) -> str:
+        """The same, tick by tick, of demonstrations that differ in where things are."""
+        return f"{self.source} {float(self.about.get('side', 0)):.3f} {self.about.get('slow', 0)}"
 
 
 def prepare(demos: list[Demo], space: Space, names: list[str] | None = None) -> list[Demonstration]:
@@ -31,7 +41,7 @@ def prepare(demos: list[Demo], space: Space, names: list[str] | None = None) -> 
     for i, demo in enumerate(demos):
         state, command = state_of(demo)
         scaled = torch.from_numpy(command) / scale if command is not None else None
-        out.append(Demonstration(state, scaled, names[i] if names else "", float(demo.attrs.get("side", 0))))
+        out.append(Demonstration(state, scaled, names[i] if names else "", demo.attrs))
     return out
 
 
@@ -229,8 +239,7 @@ class WindowSampler:
         self.seen = [torch.nonzero(self.state.known[:, i])[:, 0].numpy() for i in range(space.slots)]
         self.used = np.array([(d.state.known > 0).any(0).numpy() for d in demonstrations])
         with_command = demonstrations[0].command is not None
-        # The same motion, with the objects elsewhere.
-        names = np.array([f"{d.source} {d.side:.3f}" if d.source else "" for d in demonstrations])
+        names = np.array([d.motion if d.source else "" for d in demonstrations])
         self.same = [np.flatnonzero(names == n) if n else np.array([i]) for i, n in enumerate(names)]
         # One row more a demonstration, so that states and commands share their index.
         self.command = (
