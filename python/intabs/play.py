@@ -35,6 +35,16 @@ END_REASONS = {
     6: "the driver refused to go on (fault, stop, or another session)",
     7: "an object did not move as in the demonstration, however often it was tried",
 }
+FAULTED = 6
+# core/types.h Fault
+FAULTS = {
+    1: "commands stopped coming",
+    2: "ESTOP",
+    3: "the arm's readings stopped coming",
+    4: "the connection to the arm is lost",
+    5: "the arm reports an error",
+    6: "its loop stood still in mid-motion",
+}
 
 
 @dataclass
@@ -245,6 +255,7 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
             if not listener.handle(100) and time.monotonic() - run.spoke > 15:
                 raise UserError(f"intabs_{worlds[0]} fell silent; what it said is in {out / 'logs'}")
             report(*_standing(run))
+        fault = _first_status(url, processes).fault if run.end_reason == FAULTED and options.clock == "wall" else 0
         codes = processes.stop(patience_s=60)
     for name, code in codes.items():
         if code != 0:
@@ -252,6 +263,8 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
 
     end_us, success = end
     summary = _summary(options, run, end_us, success, {n: _figures(f) for n, f in figures.items()}, subgoals)
+    if fault:
+        summary["fault"] = fault
     summary["plan"] = {"about": plan.about, "skills": [s.index for s in plan.skills], "retries": run.skill.retries}
     if plan.predicted is not None:
         summary["plan"] |= {"predicted": plan.predicted.tolist(), "search_s": plan.search_s, "verify_s": plan.verify_s}
@@ -330,6 +343,8 @@ def _summary(
 def _why(run: _Run, summary: dict, end_us: int) -> str:
     missed = [s["name"] for s in summary["subtasks"] if not s["success"]]
     reason = END_REASONS.get(run.end_reason)
+    if fault := FAULTS.get(summary.get("fault")):
+        reason = f"the driver stopped: {fault}"
     if reason is None:
         reason = "not " + ", ".join(missed) if missed else "the goal state did not last"
     return f"{reason} (after {summary['duration_s']:.1f} s)"
