@@ -141,7 +141,9 @@ Status SkillPlayer::Tick(const Observation& observation, const JointVector& q_co
     return fail(status);
   }
   if (!zero_actions_) {
-    q_target_ += action.dq_step;
+    // Saturated: a target beyond a joint's limit is refused by the driver, and the whole arm would come to a stop.
+    const ArmModel& arm = policy_.codec().arm();
+    q_target_ = (q_target_ + action.dq_step).cwiseMax(arm.q_min()).cwiseMin(arm.q_max());
     gripper_closed_ = action.gripper_closed;
   }
   q_target = q_target_;

@@ -1,6 +1,6 @@
 // Plays a plan of skills: state assembly, pi, joint targets. Between pi's output and the command stand only
-// denormalisation and integration. A skill ends when eta says so, within its bounds; one whose effect on the objects did
-// not happen is tried again.
+// denormalisation and integration, which stops at the joints' limits. A skill ends when eta says so, within its bounds; one
+// whose effect on the objects did not happen is tried again.
 #pragma once
 
 #include <array>

@@ -76,6 +76,28 @@ TEST_CASE("A plan plays each skill for its ticks, integrates steps, and then ask
   CHECK(command.mode == ArmMode::kHold);
 }
 
+TEST_CASE("Targets stay within the joints' limits, where the driver takes them") {
+  const ArmModel arm = ArmModel::Lite6();
+  SkillController controller = MakeController();
+  Readings r;
+  for (const bool upper : {true, false}) {
+    r.status.q_commanded = upper ? arm.q_max() : arm.q_min();
+    controller.Abort(EndReason::kAborted);
+    REQUIRE(controller.Start(upper ? 1 : 2, Plan({20})) == Status::kOk);
+    JointVector lowest = arm.q_max(), highest = arm.q_min();
+    for (int i = 0; i < 20; ++i) {
+      r.Advance();
+      ArmCommand command;
+      REQUIRE(controller.Tick(r.status, r.poses, command) == Status::kOk);
+      lowest = lowest.cwiseMin(command.q_target);
+      highest = highest.cwiseMax(command.q_target);
+    }
+    CHECK((highest.array() <= arm.q_max().array()).all());
+    CHECK((lowest.array() >= arm.q_min().array()).all());
+    CHECK((lowest - highest).cwiseAbs().maxCoeff() > 0.01);  // pi moves some joints away from the limit
+  }
+}
+
 TEST_CASE("eta ends a skill between its bounds") {
   for (const float logit : {10.f, -10.f}) {
     SkillController controller = MakeController(logit);
