@@ -70,8 +70,7 @@ class Rollout {
       : session_(models_dir, task,
                  perception_config.empty() ? std::nullopt
                                            : std::optional<PerceptionConfig>(LoadPerceptionConfig(perception_config))),
-        player_(SkillPlayer::Load(weights_dir, ArmModel::Lite6(), FormatOptions(format))),
-        library_(LoadSkillLibrary(weights_dir)) {}
+        player_(SkillPlayer::Load(weights_dir, ArmModel::Lite6(), FormatOptions(format))) {}
 
   py::dict Reset(int64_t seed, double spread_cm) {
     {
@@ -83,24 +82,26 @@ class Rollout {
   }
 
   py::dict Run(const Array<float>& z, const Array<int>& ticks, const std::vector<int>& library_index, int settle_ticks,
-               const std::string& ablate, bool nudge, int film_every) {
+               const std::string& ablate, bool nudge, int film_every, bool others) {
     if (!reset_) throw std::runtime_error("reset() comes before run(): each run begins in a scene of its own");
     const auto count = static_cast<py::ssize_t>(library_index.size());
     if (z.ndim() != 2 || z.shape(1) != kLatentDim || z.shape(0) != count || ticks.ndim() != 2 || ticks.shape(0) != count ||
         ticks.shape(1) != 2)
       throw py::value_error("z must be (n, 16), ticks (n, 2), library_index n numbers");
+    const std::vector<Skill>& library = player_.library()->skills;
     std::vector<Skill> skills(library_index.size());
     for (size_t i = 0; i < skills.size(); ++i) {
       const auto row = static_cast<py::ssize_t>(i);
       const auto at = static_cast<size_t>(library_index[i]);
-      if (library_index[i] >= 0 && at >= library_.size()) throw py::value_error("library_index out of range");
-      if (library_index[i] >= 0) skills[i] = library_[at];
+      if (library_index[i] >= 0 && at >= library.size()) throw py::value_error("library_index out of range");
+      if (library_index[i] >= 0) skills[i] = library[at];
       skills[i].z = Eigen::Map<const LatentVector>(z.data(row, 0));
       skills[i].min_ticks = *ticks.data(row, 0);
       skills[i].max_ticks = *ticks.data(row, 1);
     }
     SkillController controller(player_, 1);
     controller.player().ZeroActions(ablate == "policy");
+    controller.player().TryOthers(others);
     bool success = false;
     std::vector<double> q, poses_trace, gripper;
     std::vector<int> skill_trace;
@@ -198,7 +199,6 @@ class Rollout {
   Session session_;
   bool reset_ = false;  // there is a scene
   SkillPlayer player_;
-  std::vector<Skill> library_;
   std::unique_ptr<Renderer> renderer_;
 };
 
@@ -313,10 +313,11 @@ void Bind_sim(py::module_& m) {
            py::arg("format") = "", "format of pi's weights: fp32, 16, 8; empty: the manifest's.")
       .def("reset", &Rollout::Reset, py::arg("seed"), py::arg("spread_cm"), "Starts over; what is seen then (Session.observe).")
       .def("run", &Rollout::Run, py::arg("z"), py::arg("ticks"), py::arg("library_index"), py::arg("settle_ticks") = 25,
-           py::arg("ablate") = "", py::arg("nudge") = false, py::arg("film_every") = 0,
+           py::arg("ablate") = "", py::arg("nudge") = false, py::arg("film_every") = 0, py::arg("others") = true,
            "From where reset left it. z (n, 16); ticks (n, 2): shortest and longest duration; library_index: n numbers, -1: a\n"
            "skill without a record. ablate: '', 'objects' (poses frozen at their first value) or 'policy' (zeros). nudge: the\n"
-           "first time the fingers close about an object it is knocked away by 4 cm. film_every: a picture each so many ticks.\n"
+           "first time the fingers close about an object it is knocked away by 4 cm. film_every: a picture each so many ticks. others:\n"
+           "what fails twice is tried as another demonstration did it (skills/skill_player.h).\n"
            "Returns success, reason, subgoals (bits), state_hash, duration_s, end_reason, skill (the last that ran), retries and,\n"
            "after each tick, q (T, 6), gripper (T,), skills (T,) and the true object_pose (T, 4, 7), and\n"
            "pictures [(240, 320, 3) uint8 RGB].");

@@ -89,7 +89,9 @@ def _run_trial(setting: Setting, trial: int) -> dict:
     if setting.ablate == "z":
         z = z[np.random.default_rng(seed).permutation(len(z))]
     film = max(1, int(ticks[:, 1].sum()) // STRIP) if setting.film else 0
-    result = world.run(z, ticks, index, SETTLE_TICKS, setting.ablate, setting.nudge, film)
+    # What is to be shown of given skills is shown by them alone.
+    others = not (setting.source or setting.plan == "whole" or setting.ablate == "z")
+    result = world.run(z, ticks, index, SETTLE_TICKS, setting.ablate, setting.nudge, film, others)
     for trace in ("q", "gripper", "object_pose", "skills"):
         result.pop(trace)
     pictures = result.pop("pictures")

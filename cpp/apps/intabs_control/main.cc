@@ -51,8 +51,7 @@ class Control {
   explicit Control(const Options& options)
       : options_(options),
         bus_(options.lcm, options.prefix),
-        controller_(SkillPlayer::Load(options.weights, ArmModel::Lite6()), RandomSession()),
-        library_(LoadSkillLibrary(options.weights)) {
+        controller_(SkillPlayer::Load(options.weights, ArmModel::Lite6()), RandomSession()) {
     if (!options.hand_eye.empty()) X_BW_ = LoadHandEye(options.hand_eye).Inverse();
     bus_.Subscribe(kLite6Status, std::function<void(const ArmStatus&)>([this](const ArmStatus& s) { OnStatus(s); }));
     bus_.Subscribe(kSkillPlan, std::function<void(const SkillPlan&)>([this](const SkillPlan& p) { OnPlan(p); }));
@@ -124,11 +123,12 @@ class Control {
       PublishSkillStatus();  // a re-send: the sender has not heard us
       return;
     }
-    if (!plan_.Add(part, library_)) return;
+    const std::vector<Skill>& library = controller_.player().library()->skills;
+    if (!plan_.Add(part, library)) return;
     if (controller_.Start(plan_.id(), plan_.skills()) != Status::kOk) {
       std::fprintf(stderr,
                    "intabs_control: plan %ld refused: %zu skills; it needs 1 to %d, each lasting 1 tick or more, of a library of %zu\n",
-                   static_cast<long>(plan_.id()), plan_.skills().size(), kMaxSkills, library_.size());
+                   static_cast<long>(plan_.id()), plan_.skills().size(), kMaxSkills, library.size());
       return;
     }
     started_ = true;
@@ -274,7 +274,6 @@ class Control {
   const Options options_;
   LcmBus bus_;
   SkillController controller_;
-  const std::vector<Skill> library_;
   PlanReceiver plan_;
   Newest<ArmStatus> status_;
   std::optional<ObjectPoses> poses_;  // in the arm's base

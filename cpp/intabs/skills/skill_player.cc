@@ -19,7 +19,8 @@ bool Free(const SkillRecord& record) {
 
 SkillPlayer SkillPlayer::Load(const std::string& dir, const ArmModel& arm, const NetworkOptions& options) {
   const WeightsFile weights = WeightsFile::Load(dir);
-  return {Policy::FromWeights(weights, arm, options), Termination(weights, options)};
+  return {Policy::FromWeights(weights, arm, options), Termination(weights, options),
+          std::make_shared<const SkillLibrary>(SkillLibrary::Load(dir))};
 }
 
 Status SkillPlayer::Start(int64_t plan_id, std::span<const Skill> skills) noexcept {
@@ -33,6 +34,7 @@ Status SkillPlayer::Start(int64_t plan_id, std::span<const Skill> skills) noexce
   status_.plan_id = plan_id;
   status_.n_skills = static_cast<int>(skills.size());
   status_.end_reason = EndReason::kRunning;
+  std::fill(tried_.begin(), tried_.end(), 0);
   first_ = true;
   return Status::kOk;
 }
@@ -83,6 +85,32 @@ int SkillPlayer::RetryFrom(int skill) const noexcept {
   return skill;
 }
 
+// Puts the skills of another demonstration of the task in the place of this skill's, if the plan holds all of those. Returns
+// the first of them, or -1.
+int SkillPlayer::ReplaceChain(int skill, const Observation& observation) noexcept {
+  const int chain = skills_[skill].chain;
+  if (!try_others_ || !library_ || chain < 0) return -1;
+  const int n = status_.n_skills;
+  int begin = skill, end = skill + 1;
+  while (begin > 0 && skills_[begin - 1].chain == chain) --begin;
+  while (end < n && skills_[end].chain == chain) ++end;
+  if (end - begin != library_->chains[chain].count) return -1;
+  tried_[chain] = 1;
+  const int other = library_->Nearest(chain, observation, tried_);
+  if (other < 0) return -1;
+  const Chain& with = library_->chains[other];
+  const int longer = with.count - (end - begin);
+  if (n + longer > kMaxSkills) return -1;
+  if (longer > 0) {
+    std::move_backward(skills_.begin() + end, skills_.begin() + n, skills_.begin() + n + longer);
+  } else {
+    std::move(skills_.begin() + end, skills_.begin() + n, skills_.begin() + end + longer);
+  }
+  std::copy_n(library_->skills.begin() + with.first, with.count, skills_.begin() + begin);
+  status_.n_skills = n + longer;
+  return begin;
+}
+
 // The running skill is over.
 void SkillPlayer::GoOn(SkillEnd why, const Observation& observation) noexcept {
   if (Missing(skills_[status_.skill_index].record, observation)) {
@@ -90,8 +118,9 @@ void SkillPlayer::GoOn(SkillEnd why, const Observation& observation) noexcept {
       status_.end_reason = EndReason::kNoEffect;
       return;
     }
-    ++status_.retries;
-    Begin(RetryFrom(status_.skill_index), SkillEnd::kNoEffect, observation);
+    // What failed twice is likely to fail again: then as another demonstration did it.
+    const int other = status_.retries++ ? ReplaceChain(status_.skill_index, observation) : -1;
+    Begin(other < 0 ? RetryFrom(status_.skill_index) : other, SkillEnd::kNoEffect, observation);
   } else if (status_.skill_index + 1 == status_.n_skills) {
     status_.end_reason = EndReason::kFinished;
     status_.skill_end = why;

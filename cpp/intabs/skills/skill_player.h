@@ -11,41 +11,16 @@
 #include "intabs/core/status.h"
 #include "intabs/core/types.h"
 #include "intabs/skills/policy.h"
+#include "intabs/skills/skill_library.h"
 #include "intabs/skills/state.h"
 #include "intabs/skills/termination.h"
 
 namespace intabs {
 
-// What the demonstration did in a skill, to notice when it does not happen and to know where to try again from.
-struct SkillRecord {
-  // How far each object had come at most by its end, |dp| + kTurnLength * angle [m], from where it last rested as a skill
-  // began; whether it did so as this one began.
-  std::array<float, kMaxObjects> moved{};
-  std::array<bool, kMaxObjects> rested{};
-  bool closed = false;  // the gripper was, as this one began
-  SkillRecord() { rested.fill(true); }
-};
-
-struct Skill {
-  LatentVector z = LatentVector::Zero();
-  int32_t min_ticks = 1;  // of the policy; it is expected to last the mean of the two
-  int32_t max_ticks = 1;
-  SkillRecord record;  // nothing moved: nothing is demanded
-};
-
-// How long it is expected to last [ticks], and at which phase of it a tick is: 0 the first, 1 the last and after.
-inline int ExpectedTicks(const Skill& s) { return (s.min_ticks + s.max_ticks) / 2; }
-inline float SkillPhase(const Skill& s, int tick) {
-  const int last = ExpectedTicks(s) - 1;
-  return last < 1 || tick >= last ? (tick > 0 ? 1.f : 0.f) : static_cast<float>(tick) / static_cast<float>(last);
-}
-
-inline constexpr float kTurnLength = 0.1f;     // [m/rad]
 inline constexpr float kEffect = 0.05f;        // [m] an object that came so far in the record is demanded to come ...
 inline constexpr float kEffectShare = 0.4f;    // ... this share of it
-inline constexpr int kMaxRetries = 3;          // in a plan
+inline constexpr int kMaxRetries = 3;          // in a plan; the first by the same skills
 inline constexpr int kMaxSkills = 128;       // in a plan
-inline constexpr int kMaxSkillTicks = 15000;  // 10 minutes
 
 // Why the player is not playing. The numbers travel in SKILL_STATUS.
 enum class EndReason : int8_t {
@@ -80,8 +55,10 @@ struct PlayerStatus {
 
 class SkillPlayer {
  public:
-  SkillPlayer(Policy policy, Termination termination)
-      : policy_(std::move(policy)), termination_(std::move(termination)) {}
+  SkillPlayer(Policy policy, Termination termination, std::shared_ptr<const SkillLibrary> library = nullptr)
+      : policy_(std::move(policy)), termination_(std::move(termination)), library_(std::move(library)) {
+    if (library_) tried_.resize(library_->chains.size());
+  }
   // Throws std::runtime_error with one line that names what in the folder does not fit.
   static SkillPlayer Load(const std::string& weights_dir, const ArmModel& arm, const NetworkOptions& options = {});
 
@@ -99,7 +76,10 @@ class SkillPlayer {
   bool playing() const noexcept { return status_.end_reason == EndReason::kRunning; }
   const PlayerStatus& status() const noexcept { return status_; }
   const Policy& policy() const noexcept { return policy_; }
+  const SkillLibrary* library() const noexcept { return library_.get(); }  // null: none
 
+  // Whether what fails may be tried by another demonstration's skills. To try out a demonstration by itself: false.
+  void TryOthers(bool on) noexcept { try_others_ = on; }
   // Ablation: pi's output is replaced by zeros.
   void ZeroActions(bool on) noexcept { zero_actions_ = on; }
 
@@ -109,9 +89,13 @@ class SkillPlayer {
   void Watch(const Observation& observation) noexcept;
   bool Missing(const SkillRecord& record, const Observation& observation) const noexcept;
   int RetryFrom(int skill) const noexcept;
+  int ReplaceChain(int skill, const Observation& observation) noexcept;
 
   Policy policy_;
   Termination termination_;
+  std::shared_ptr<const SkillLibrary> library_;
+  std::vector<char> tried_;  // chains of the library, in this plan
+  bool try_others_ = true;
   std::array<Skill, kMaxSkills> skills_;
   PlayerStatus status_;
   int tick_ = 0;  // in the running skill

@@ -13,9 +13,10 @@ namespace {
 
 constexpr int64_t kSession = 77;
 
-SkillController MakeController(float eta_logit = 0) {
+SkillController MakeController(float eta_logit = 0, std::shared_ptr<const SkillLibrary> library = nullptr) {
   const WeightsFile weights = RandomPolicyWeights(kPolicyInputDim, kStateLayout, kPolicyPeriodUs, eta_logit);
-  return SkillController(SkillPlayer(Policy::FromWeights(weights, ArmModel::Lite6()), Termination(weights)), kSession);
+  SkillPlayer player(Policy::FromWeights(weights, ArmModel::Lite6()), Termination(weights), std::move(library));
+  return SkillController(std::move(player), kSession);
 }
 
 std::vector<Skill> Plan(std::initializer_list<int> ticks) {
@@ -165,6 +166,92 @@ TEST_CASE("What moves a second time in one grasp is tried again from before the 
     if (controller.player().status().retries == 1) least = std::min(least, controller.player().status().skill_index);
   }
   CHECK(least == 1);
+}
+
+// Three demonstrations of a task: near, never done in practice, far; one of another task.
+std::shared_ptr<SkillLibrary> FourDemonstrations(const Readings& r) {
+  auto library = std::make_shared<SkillLibrary>();
+  for (const int count : {5, 4, 3, 6}) {
+    Chain chain;
+    chain.first = static_cast<int>(library->skills.size());
+    chain.count = count;
+    chain.task = count == 6;
+    chain.rate = count == 4 ? 0.f : 1.f;
+    chain.q = r.status.q;
+    chain.objects[0] = r.poses.objects[0];
+    chain.objects[0].X_WO.p.x() += 0.01 * (5 - count);
+    for (int i = 0; i < count; ++i) {
+      Skill skill = Plan({2})[0];
+      skill.chain = static_cast<int>(library->chains.size());
+      if (i + 1 == count) skill.record.moved[0] = 0.06f;
+      library->skills.push_back(skill);
+    }
+    library->chains.push_back(chain);
+  }
+  return library;
+}
+
+TEST_CASE("What fails twice is tried as another demonstration did it that does the task in practice") {
+  Readings r;
+  const auto library = FourDemonstrations(r);
+  SkillController controller = MakeController(0, library);
+  ArmCommand command;
+  std::vector<Skill> plan(library->skills.begin(), library->skills.begin() + 5);
+  plan.push_back(library->skills.back());  // of the other task: not all of its demonstration's
+  const auto play = [&](int id, bool moves) {
+    REQUIRE(controller.Start(id, plan) == Status::kOk);
+    std::vector<int> skills;  // of the plan, at each retry
+    int retries = 0;
+    while (controller.player().playing()) {
+      r.Advance();
+      if (controller.Tick(r.status, r.poses, command) != Status::kOk) continue;
+      const PlayerStatus& now = controller.player().status();
+      if (now.retries > retries) skills.push_back(now.n_skills);
+      retries = now.retries;
+      if (moves && retries == 2) r.poses.objects[0].X_WO.p.z() += 0.02;
+    }
+    return skills;
+  };
+  CHECK(play(1, false) == std::vector<int>{6, 4, 4});  // five by the first, then three by the far one; nobody is left
+  CHECK(controller.player().status().end_reason == EndReason::kNoEffect);
+  CHECK(controller.player().status().skill_index == 2);
+  CHECK(play(2, true) == std::vector<int>{6, 4});  // forgotten with the plan; what follows stays
+  CHECK(controller.player().status().end_reason == EndReason::kFinished);
+  CHECK(controller.player().status().skill_index == 3);
+
+  controller.player().TryOthers(false);
+  CHECK(play(3, false) == std::vector<int>{6, 6, 6});
+  controller.player().TryOthers(true);
+  plan.erase(plan.begin());  // not the demonstration as a whole: nobody asked for more
+  CHECK(play(4, false) == std::vector<int>{5, 5, 5});
+}
+
+TEST_CASE("The demonstration that began most like now is the nearest") {
+  Readings r;
+  const auto library = FourDemonstrations(r);
+  Observation now;
+  now.q = r.status.q;
+  now.objects = r.poses.objects;
+  CHECK(library->Nearest(2, now, {0, 0, 0, 0}) == 0);
+  now.objects[0].X_WO.p.x() += 0.015;
+  CHECK(library->Nearest(0, now, {0, 0, 0, 0}) == 2);  // the second is nearer, but never did it
+  CHECK(library->Nearest(0, now, {0, 0, 1, 0}) == 0);
+  CHECK(library->Nearest(0, now, {1, 0, 1, 0}) == -1);
+}
+
+TEST_CASE("The shipped library holds its demonstrations whole") {
+  const SkillLibrary library = SkillLibrary::Load(INTABS_SOURCE_DIR "/models/weights/lite6");
+  REQUIRE(library.chains.size() >= 30);
+  int next = 0, seen = 0;
+  for (const Chain& chain : library.chains) {
+    CHECK(chain.first == next);
+    next += chain.count;
+    CHECK((chain.rate >= 0 && chain.rate <= 1));
+    for (const TrackedObject& object : chain.objects) seen += object.id >= 0;
+  }
+  CHECK(next == static_cast<int>(library.skills.size()));
+  CHECK(seen > static_cast<int>(library.chains.size()));
+  CHECK_THROWS_WITH(SkillLibrary::Load("nowhere"), Catch::Contains("nowhere/skills.json"));
 }
 
 TEST_CASE("An effect that happens, even late, and one that cannot be seen are no reason to try again") {
@@ -344,20 +431,23 @@ TEST_CASE("The policy tick does not allocate") {
     return;
   }
   REQUIRE(AllocationHookSeesAll());  // positive control
-  SkillController controller = MakeController();
   Readings r;
+  const auto library = FourDemonstrations(r);
+  SkillController controller = MakeController(0, library);
   ArmCommand command;
   REQUIRE(controller.Start(1, Plan({40, 40, 40})) == Status::kOk);
-  int played = 0;
+  int played = 0, shortest = 5;
   const AllocationCounter counter;
   for (int i = 0; i < 200; ++i) {
     r.Advance();
     played += controller.Tick(r.status, r.poses, command) == Status::kOk;
-    if (i == 130) (void)controller.Start(2, std::span<const Skill>());
+    if (i == 130) (void)controller.Start(2, std::span<const Skill>(library->skills).first(5));
+    if (i > 130) shortest = std::min(shortest, controller.player().status().n_skills);
   }
   const auto n = counter.count();
   CHECK(n == 0);
-  CHECK(played == 120);
+  CHECK(played == 120 + 10 + 10 + 6 + 6);
+  CHECK(shortest == 3);  // another demonstration's skills were put in
 }
 
 }  // namespace
