@@ -17,6 +17,7 @@ from intabs.evaluate.metrics import Motion, Sample
 
 KERNELS = 15
 DISTANCE = 15  # ticks, between peaks
+TICK = 1 / 64  # s, by the package's clock, which integrates by its millisecond; sums of it are exact
 
 
 def peaks(x: np.ndarray) -> list[int]:
@@ -106,14 +107,16 @@ class Hdmp:
         got_x, got_q = x.copy(), q.copy()
         for a, b in zip(at, at[1:], strict=False):
             steps = b - a
-            time = np.arange(steps + 1.0)
-            dmp = DMP(x.shape[1], steps, 1.0, n_weights_per_dim=KERNELS, smooth_scaling=True)
+            time = TICK * np.arange(steps + 1)
+            # As many kernels as ticks fit to anything but the motion in between.
+            kernels = min(KERNELS, max(1, steps // 2))
+            dmp = DMP(x.shape[1], time[-1], TICK, n_weights_per_dim=kernels, smooth_scaling=True)
             dmp.imitate(time, x[a : b + 1])
             dmp.configure(start_y=got_x[a])
             got_x[a + 1 : b + 1] = dmp.open_loop()[1][1 : steps + 1]
             for k in range(q.shape[1]):
                 pose = np.concatenate([np.zeros((steps + 1, 3)), q[a : b + 1, k]], 1)
-                turn = CartesianDMP(steps, 1.0, n_weights_per_dim=KERNELS, smooth_scaling=True)
+                turn = CartesianDMP(time[-1], TICK, n_weights_per_dim=kernels, smooth_scaling=True)
                 turn.imitate(time, pose)
                 turn.configure(start_y=np.concatenate([np.zeros(3), got_q[a, k]]))
                 got_q[a + 1 : b + 1, k] = turn.open_loop()[1][1 : steps + 1, 3:]
