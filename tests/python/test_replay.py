@@ -97,7 +97,7 @@ def test_replays_from_another_side_succeed_and_a_library_takes_the_one_most_like
     (name,) = DemoFile(data).names
     replays = []
     for seed, side in ((7, 0.0), (8, ANOTHER_SIDE)):
-        _, replay = module.attempt(Try(name, poured[1][1], seed, 0.5, 0.0, None, side))
+        _, replay = module.attempt(Try(name, poured[1][1], seed, 0.5, 0.0, None, False, side))
         assert replay.attrs["side"] == side
         replay.attrs |= {"task": "pour", "source": name}
         replays.append(replay)
@@ -135,6 +135,19 @@ def test_a_start_too_far_for_the_recordings_pace_makes_the_way_there_longer(demo
     assert np.abs(np.diff(path, axis=0)).max() <= MAX_STEP
     np.testing.assert_allclose(path[0], far)
     np.testing.assert_allclose(path[at[n + 5] :], slow.q_target[at[n + 5] :])
+
+
+def test_a_replay_may_begin_where_a_grasp_was_missed(demo):
+    replayer = Replayer("pick_place")
+    about = outline(demo, replayer.arm)
+    replay = replayer.replay(demo, about, 5, 6.0, 0.0, np.full(6, 0.02), at_grasp=True)
+    assert not isinstance(replay, str), replay
+    path = replayer.commands(demo, about, replay.object_pose[0])
+    grasp = int(np.argmax(about.gripper))
+    assert np.abs(replay.joint_pos[0] - path[grasp] - 0.02).max() < 0.01 and not replay.gripper[0]
+    in_tip = np.linalg.norm(np.asarray(replayer.arm.tip(replay.joint_pos[0]))[:3] - replay.object_pose[0, 0, :3])
+    assert in_tip < 0.06
+    np.testing.assert_allclose(replay.joint_pos[grasp], path[grasp], atol=0.05)  # and comes there as recorded
 
 
 def test_a_turn_in_the_plane_is_measured():

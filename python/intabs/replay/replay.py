@@ -35,8 +35,11 @@ RETURN = 0.12  # of a disturbance, a tick, that the recorded commands take back
 MIN_SPREAD = 1.0  # cm
 REPLAY_SEEDS = 300000  # of the plant; evaluation uses others
 MAX_STEP = 0.08  # rad a tick (2 rad/s): a path that is faster is not tried
-ELSEWHERE = 0.5  # share of the replays that do not start at home: half of them where another demonstration ended,
-START_RAD = 0.15  # half of them so far from home (standard deviation, each joint)
+AT_ENDS = 0.2  # share of the replays that start where another demonstration ended,
+AT_GRASP = 0.15  # where the gripper closed, so far beside it: a grasp that was missed is tried again from there,
+BESIDE_RAD = 0.03
+NEAR_HOME = 0.15  # so far from home (standard deviations, each joint); the others at home
+START_RAD = 0.15
 SLOW = 40  # ticks more on the way to the object where a start is too far for the recording's pace
 DRIVE_STEP = 0.03  # rad a tick, on the way to such a start
 ROUND = {("pour", 1)}  # task, slot: objects that things may come to from any side,
@@ -200,26 +203,31 @@ class Replayer:
         disturb: float,
         start: np.ndarray | None = None,
         side: float = 0.0,
+        at_grasp: bool = False,
     ) -> Demo | str:
         """One try with the objects where the plant puts them for this seed; the reason if it failed.
 
         disturb: standard deviation [rad] of pushes the commands get now and then and take back (Laskey et al., DART,
         2017); what is recorded as the action takes back, it does not push. start: joints (6,) [rad] to begin at; None:
-        the recording's. The way there is not recorded. side: as for commands."""
+        the recording's. at_grasp: counted from where the gripper closes. The way there is not recorded. side: as for
+        commands."""
         session = self.session
         session.reset(seed, spread_cm)
         rng = np.random.default_rng(seed)
         path = self.commands(demo, about, session.observe()["object_pose"], side)
         if path is None:
             return "out of reach" if not side else "out of reach, from another side"
-        slow = 0
+        slow, there = 0, path[:0]
+        if at_grasp:
+            there = path[: int(np.argmax(about.gripper)) + 1]
+            start = there[-1] + start
         if start is not None:
             far = started_at(start, path, about, (1.0,))
             if far is None:
                 slow, about = SLOW, slowed(about, SLOW)
                 path = self.commands(demo, about, session.observe()["object_pose"], side)
                 far = started_at(start, path, about, (1.0, 0.75, 0.5, 0.25, 0.0)) if path is not None else None
-            if far is None or not self.drive(far[0]):
+            if far is None or not (self.along(there) and self.drive(far[0])):
                 return "start out of reach"
             path = far
         rows, pushed, target = [], np.zeros(6), path[0].copy()
@@ -243,6 +251,10 @@ class Replayer:
             return session.failure_reason.split(" [")[0]
         how = {"seed": seed, "spread_cm": spread_cm, "side": side, "slow": slow, "approach": about.approach}
         return Demo(*(np.array(x) for x in zip(*rows, strict=True)), how)
+
+    def along(self, way: np.ndarray) -> bool:
+        """By these targets (n, 6), the gripper open; whether the driver let it."""
+        return all(self.session.command(target, False) == 0 for target in way)
 
     def drive(self, to: np.ndarray) -> bool:
         """Joint by joint in step, to rest there; whether the driver let it."""
@@ -269,6 +281,7 @@ class Try:
     spread_cm: float
     disturb: float
     start: np.ndarray | None
+    at_grasp: bool
     side: float
 
 
@@ -284,7 +297,9 @@ def attempt(one: Try) -> tuple[Try, Demo | str]:
     if about is None:
         return one, "nothing is moved in the recording"
     side = one.side if (task, about.other) in ROUND else 0.0
-    return one, _replayers[task].replay(one.demo, about, one.seed, one.spread_cm, one.disturb, one.start, side)
+    return one, _replayers[task].replay(
+        one.demo, about, one.seed, one.spread_cm, one.disturb, one.start, side, one.at_grasp
+    )
 
 
 def make(
@@ -323,11 +338,13 @@ def make(
     frames = done = 0
     ends = np.array([demo.joint_pos[-1] for _, demo in recorded])
 
-    def start(demo: Demo, rng: np.random.Generator) -> np.ndarray | None:
-        kind, end, push = rng.random(), ends[rng.integers(len(ends))], START_RAD * rng.normal(size=6)
-        if kind > ELSEWHERE:
-            return None
-        return end if kind < 0.5 * ELSEWHERE else demo.joint_pos[0] + push
+    def start(demo: Demo, rng: np.random.Generator) -> tuple[np.ndarray | None, bool]:
+        kind, end, push = rng.random(), ends[rng.integers(len(ends))], rng.normal(size=6)
+        if kind < AT_ENDS:
+            return end, False
+        if kind < AT_ENDS + AT_GRASP:
+            return BESIDE_RAD * push, True
+        return (demo.joint_pos[0] + START_RAD * push if kind < AT_ENDS + AT_GRASP + NEAR_HOME else None), False
 
     def tries():
         # A source that cannot be replayed must not keep this going for ever.
@@ -338,9 +355,9 @@ def make(
                 if figures[task]["demos"] >= wanted[task]:
                     break
                 name, demo = by_task[task][k % len(by_task[task])]
-                spread = float(rng.uniform(MIN_SPREAD, spread_cm))
+                spread = max(MIN_SPREAD, spread_cm * float(np.sqrt(rng.random())))  # far away there is more room
                 side = ANOTHER_SIDE * sided.integers(-1, 2) if sides else 0.0
-                yield Try(name, demo, REPLAY_SEEDS + seed + k, spread, disturb, start(demo, rng), side)
+                yield Try(name, demo, REPLAY_SEEDS + seed + k, spread, disturb, *start(demo, rng), side)
 
     with (
         DemoWriter(out, {**attrs, "task": "all", "replays_of": data.name}, 0.0) as writer,
