@@ -1,4 +1,4 @@
-"""`intabs demo`: cameras, policy and arm as separate programs; one task from the shipped weights."""
+"""`intabs demo`: cameras, policy and arm as separate programs; one learned task."""
 
 from __future__ import annotations
 
@@ -47,6 +47,7 @@ def register(app: typer.Typer) -> None:
         arm: Annotated[
             Arm, typer.Option(help="plant: MuJoCo; lite6: the arm's driver and a fake controller before MuJoCo.")
         ] = Arm.plant,
+        weights: Annotated[str, typer.Option(help="A name in models/weights, or a folder.")] = "lite6",
         seed: Seed = 0,
         out: Out = Path("out/demo"),
         viewer: Viewer = False,
@@ -59,7 +60,9 @@ def register(app: typer.Typer) -> None:
             raise UserError("--arm lite6 runs by the wall clock: leave out --clock lockstep")
         rule = clock or (Clock.wall if arm == Arm.lite6 else Clock.lockstep)
         play_and_tell(
-            play.Options(task, perception.value, rule.value, arm.value, seed, out=out, viewer=viewer), "demo", json
+            play.Options(task, perception.value, rule.value, arm.value, seed, out=out, viewer=viewer, weights=weights),
+            "demo",
+            json,
         )
 
 
