@@ -10,6 +10,10 @@ namespace intabs {
 
 namespace {
 
+float Apart(const Pose& a, const Pose& b) {
+  return static_cast<float>((b.p - a.p).norm() + kTurnLength * AngleBetween(a.q, b.q));
+}
+
 // Nothing was moving or held as it began.
 bool Free(const SkillRecord& record) {
   return !record.closed && std::all_of(record.rested.begin(), record.rested.end(), std::identity{});
@@ -61,10 +65,10 @@ void SkillPlayer::Begin(int skill, SkillEnd why, const Observation& observation)
 // What is not seen is not judged.
 void SkillPlayer::Watch(const Observation& observation) noexcept {
   for (int i = 0; i < kMaxObjects; ++i) {
-    const TrackedObject &was = before_[i], &is = observation.objects[i];
-    if (was.id < 0 || !was.valid || !is.valid) continue;
-    const double d = (is.X_WO.p - was.X_WO.p).norm() + kTurnLength * AngleBetween(was.X_WO.q, is.X_WO.q);
-    moved_[i] = std::max(moved_[i], static_cast<float>(d));
+    const TrackedObject& is = observation.objects[i];
+    if (!is.valid) continue;
+    if (before_[i].id >= 0 && before_[i].valid) moved_[i] = std::max(moved_[i], Apart(before_[i].X_WO, is.X_WO));
+    if (at_start_[i].id >= 0 && at_start_[i].valid) came_[i] = std::max(came_[i], Apart(at_start_[i].X_WO, is.X_WO));
   }
 }
 
@@ -73,6 +77,8 @@ bool SkillPlayer::Missing(const SkillRecord& record, const Observation& observat
   for (int i = 0; i < kMaxObjects; ++i) {
     if (record.moved[i] <= kEffect || before_[i].id < 0 || !before_[i].valid || !observation.objects[i].valid) continue;
     if (moved_[i] < kEffectShare * record.moved[i]) return true;
+    // What is there already when it is tried again counts.
+    if (record.done && std::max(moved_[i], came_[i]) < kDoneShare * record.moved[i]) return true;
   }
   return false;
 }
@@ -145,8 +151,9 @@ Status SkillPlayer::Tick(const Observation& observation, const JointVector& q_co
       gripper_closed_ = observation.gripper_closed;
     }
     first_ = false;
-    before_ = observation.objects;  // also for a plan that begins amid a motion
+    before_ = at_start_ = observation.objects;  // also for a plan that begins amid a motion
     moved_.fill(0);
+    came_.fill(0);
     Begin(0, SkillEnd::kNone, observation);
   }
   Watch(observation);

@@ -19,6 +19,7 @@ namespace intabs {
 
 inline constexpr float kEffect = 0.05f;        // [m] an object that came so far in the record is demanded to come ...
 inline constexpr float kEffectShare = 0.4f;    // ... this share of it
+inline constexpr float kDoneShare = 0.75f;     // ... and this much where the record had done it before (SkillRecord::done)
 inline constexpr int kMaxRetries = 3;          // in a plan; the first by the same skills
 inline constexpr int kMaxSkills = 128;       // in a plan
 
@@ -104,6 +105,8 @@ class SkillPlayer {
   bool zero_actions_ = false;
   std::array<TrackedObject, kMaxObjects> before_;  // where each object last rested
   std::array<float, kMaxObjects> moved_{};         // as in SkillRecord
+  std::array<TrackedObject, kMaxObjects> at_start_;  // as the plan began,
+  std::array<float, kMaxObjects> came_{};          // how far each had come from there at most
   JointVector q_target_ = JointVector::Zero();
   bool gripper_closed_ = false;
 };

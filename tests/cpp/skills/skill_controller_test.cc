@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <catch2/catch.hpp>
 #include <limits>
+#include <set>
 #include <vector>
 
 #include "common/alloc_hook.h"
@@ -226,6 +227,30 @@ TEST_CASE("What fails twice is tried as another demonstration did it that does t
   CHECK(play(4, false) == std::vector<int>{5, 5, 5});
 }
 
+TEST_CASE("What the record had done before, with nothing else there, is demanded nearly whole") {
+  const double came = GENERATE(0.05, 0.09);
+  const bool done = GENERATE(true, false);
+  SkillController controller = MakeController();
+  Readings r;
+  ArmCommand command;
+  std::vector<Skill> plan = Plan({2, 2, 2});
+  for (Skill& s : plan) s.record.rested[0] = false;
+  plan[0].record.rested[0] = true;
+  plan[1].record.moved[0] = plan[2].record.moved[0] = 0.1f;
+  plan[2].record.done = done;
+  REQUIRE(controller.Start(1, plan) == Status::kOk);
+  while (controller.player().playing()) {
+    r.Advance();
+    (void)controller.Tick(r.status, r.poses, command);
+    const PlayerStatus& now = controller.player().status();
+    if (now.retries == 0 && now.skill_index == 1) r.poses.objects[0].X_WO.p.x() = 0.28 + came;
+    if (now.retries == 1 && now.skill_index == 1) r.poses.objects[0].X_WO.p.x() = 0.28 + came + 0.045;
+  }
+  // The second time it comes 4.5 cm further of 10: what was there already counts.
+  CHECK(controller.player().status().retries == (done && came < 0.075 ? 1 : 0));
+  CHECK(controller.player().status().end_reason == EndReason::kFinished);
+}
+
 TEST_CASE("The demonstration that began most like now is the nearest") {
   Readings r;
   const auto library = FourDemonstrations(r);
@@ -250,6 +275,12 @@ TEST_CASE("The shipped library holds its demonstrations whole") {
     for (const TrackedObject& object : chain.objects) seen += object.id >= 0;
   }
   CHECK(next == static_cast<int>(library.skills.size()));
+  // Drawers and lids are alone in their worlds.
+  std::set<int> alone;
+  for (const Skill& skill : library.skills) {
+    if (skill.record.done) alone.insert(library.chains[skill.chain].task);
+  }
+  CHECK(alone.size() == 2);
   CHECK(seen > static_cast<int>(library.chains.size()));
   CHECK_THROWS_WITH(SkillLibrary::Load("nowhere"), Catch::Contains("nowhere/skills.json"));
 }
