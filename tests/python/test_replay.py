@@ -61,12 +61,43 @@ def test_a_grasp_goes_along_with_its_object(demo):
     np.testing.assert_allclose(path[-1], replayer.commands(demo, about, demo.object_pose[0])[-1], atol=2e-3)
 
 
+def recorded(task: str) -> list:
+    """Shipped recordings, (name, demonstration)."""
+    with DemoFile(paths.MODELS / "demos/lite6.hdf5", "train") as f:
+        own = [k for k in range(len(f)) if f.own_attrs(k)["task"] == task]
+        return [(f.names[k], pad_slots(f.demo(k))) for k in own]
+
+
 @pytest.fixture(scope="module")
 def poured():
-    """Recordings of pour, (name, demonstration)."""
-    with DemoFile(paths.MODELS / "demos/lite6.hdf5", "train") as f:
-        pours = [k for k in range(len(f)) if f.own_attrs(k)["task"] == "pour"]
-        return [(f.names[k], pad_slots(f.demo(k))) for k in pours]
+    return recorded("pour")
+
+
+def test_what_is_lowered_into_a_bowl_goes_with_the_bowl_before(demo):
+    """Else it comes down on the rim where the bowl lies elsewhere."""
+    arm = _core.ArmModel.lite6()
+    for name, stirred in recorded("stir"):
+        about = outline(stirred, arm)
+        spoon, bowl = stirred.object_pose[:, about.mover], stirred.object_pose[:, about.other]
+        # The spoon hangs .086 m down from its grip; the bowl's rim is .052 m above the table.
+        lowered = (spoon[:, 2] - 0.086 < bowl[:, 2] + 0.052) & (np.linalg.norm((spoon - bowl)[:, :2], axis=1) < 0.04)
+        assert lowered.any() and about.to_other[np.argmax(lowered)] > 0.97, name
+
+
+def test_a_replay_that_the_command_filter_would_stop_is_not_tried(poured):
+    """A cup so near the base that the hand cannot be level behind it."""
+    replayer = Replayer("pour")
+    name, demo = poured[5]
+    about = outline(demo, replayer.arm)
+    assert name == "demo_36" and "too near" in replayer.replay(demo, about, 390005, 6.8, 0.0)
+    session = replayer.session
+    session.reset(390005, 6.8)
+    path = replayer.commands(demo, about, session.observe()["object_pose"])
+    grasp = int(np.argmax(about.gripper))
+    for t, q in enumerate(path[: grasp + 1]):
+        assert session.command(q, bool(about.gripper[t])) == 0
+    tip = np.asarray(replayer.arm.tip(session.observe()["q"]))[:3]
+    assert np.linalg.norm(tip - np.asarray(replayer.arm.tip(path[grasp]))[:3]) > 0.03  # it is right not to
 
 
 def test_a_bowl_may_be_come_to_from_another_side(poured):

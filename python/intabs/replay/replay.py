@@ -23,10 +23,12 @@ from intabs import _core, paths
 from intabs.data.demos import OBJECT_SLOTS, Demo, DemoWriter
 from intabs.errors import UserError
 from intabs.jobs import in_processes
+from intabs.skills.library import TURN_LENGTH, rotation
 
 REACHED = 0.9  # of to_mover: the way to the object is over
 NEAR_GRASP = 0.08  # m, tip from the place where the object begins to move: there D is D_i
-NEAR_GOAL = 0.10  # m, moved object from the other one: there D is D_j
+NEAR_GOAL = 0.03  # m, moved object from where it comes nearest to the other one, from above: there D is D_j, and what
+# is lowered into it then goes with it
 SMOOTH = 4.0  # ticks, of D's weights
 MOVED = 0.015  # m or
 TURNED = 0.15  # rad: an object that moved in a demonstration
@@ -42,6 +44,9 @@ NEAR_HOME = 0.15  # so far from home (standard deviations, each joint); the othe
 START_RAD = 0.15
 SLOW = 40  # ticks more on the way to the object where a start is too far for the recording's pace
 DRIVE_STEP = 0.03  # rad a tick, on the way to such a start
+LOOK = 4  # ticks apart, where it is looked whether the command filter would stop the arm,
+INTO_MARGIN = 0.015  # m: so far inside its margin it often gets past
+KNOCKED = 0.015  # m (a turn counts TURN_LENGTH a radian): an object that moves so far as the hand is put beside it
 ROUND = {("pour", 1)}  # task, slot: objects that things may come to from any side,
 ANOTHER_SIDE = 1.1  # rad: about their axis by so much,
 SIDES = (-1, 0, 0, 0, 0, 1)  # this way or that, if asked for: most as recorded, or the cup is grasped less well
@@ -96,7 +101,8 @@ def outline(demo: Demo, arm) -> Outline | None:
         distance = np.array([np.linalg.norm(path - p[:, j].mean(0), axis=1) for j in others])
         k = int(np.argmin(distance[:, began:].min(1)))
         other = others[k]
-        to_other = _progress(distance[k], NEAR_GOAL)
+        level = np.linalg.norm(path[:, :2] - p[:, other, :2].mean(0), axis=1)
+        to_other = _progress(level, level[began:].min() + NEAR_GOAL)
         to_other[:began] = 0
         at_other = _progress(distance[k], NEAR_ROUND, back=True)
     return Outline(target, demo.actions[:, 6] > 0, mover, other, to_mover, to_other, at_other,
@@ -215,20 +221,33 @@ class Replayer:
         session = self.session
         session.reset(seed, spread_cm)
         rng = np.random.default_rng(seed)
-        path = self.commands(demo, about, session.observe()["object_pose"], side)
+        pose = session.observe()["object_pose"]
+        path = self.commands(demo, about, pose, side)
+        out_of_reach = "out of reach" + ", from another side" * bool(side)
         if path is None:
-            return "out of reach" if not side else "out of reach, from another side"
-        slow, there = 0, path[:0]
+            return out_of_reach
+        if min(min(_core.arm_clearance(q)) for q in path[::LOOK]) < -INTO_MARGIN:
+            return "the arm would come too near to itself or the table"
+        slow = 0
         if at_grasp:
             there = path[: int(np.argmax(about.gripper)) + 1]
             start = there[-1] + start
+            if not (self.along(there) and self.drive(start)):
+                return "start out of reach"
+            old, new = pose[about.mover], session.observe()["object_pose"]  # what was touched lies elsewhere
+            turned = (rotation(old).inv() * rotation(new[about.mover])).magnitude()
+            if np.linalg.norm(new[about.mover, :3] - old[:3]) + TURN_LENGTH * turned > KNOCKED:
+                return "knocked away as the hand was put beside it"
+            path = self.commands(demo, about, new, side)
+            if path is None:
+                return out_of_reach
         if start is not None:
             far = started_at(start, path, about, (1.0,))
             if far is None:
                 slow, about = SLOW, slowed(about, SLOW)
                 path = self.commands(demo, about, session.observe()["object_pose"], side)
                 far = started_at(start, path, about, (1.0, 0.75, 0.5, 0.25, 0.0)) if path is not None else None
-            if far is None or not (self.along(there) and self.drive(far[0])):
+            if far is None or not self.drive(far[0]):
                 return "start out of reach"
             path = far
         rows, pushed, target = [], np.zeros(6), path[0].copy()
@@ -356,7 +375,7 @@ def make(
                 if figures[task]["demos"] >= wanted[task]:
                     break
                 name, demo = by_task[task][k % len(by_task[task])]
-                spread = max(MIN_SPREAD, spread_cm * float(np.sqrt(rng.random())))  # far away there is more room
+                spread = max(MIN_SPREAD, spread_cm * float(np.cbrt(rng.random())))  # far away there is more room
                 side = ANOTHER_SIDE * float(sided.choice(SIDES)) if sides else 0.0
                 yield Try(name, demo, REPLAY_SEEDS + seed + k, spread, disturb, *start(demo, rng), side)
 
