@@ -38,23 +38,20 @@ def start_linear(
     rows = _Rows(model, batches)
     agent, objects = _courses(space, rows, error, groups)
     course = torch.cat([agent, objects], 1)
-    names = list(model.encoders)
-    size = 2 * LATENT // len(names)
-    wanted = {name: course - course.mean(0) for name in names}  # what z of each encoder is to tell
-    turns = 1
-    if space.arm is not None:  # beside the state, which pi's linear path sees; each the rest that the other leaves
-        rest = course - _fitted(rows.start, course)
-        wanted, turns = {name: rest for name in names}, TURNS if len(names) > 1 else 1
-    elif len(names) > 1:  # its own part: with few motions what one tells of the other's is chance (grab_hand)
-        wanted["q_agent"][:, agent.shape[1] :] = 0
-        wanted["q_environment"] = torch.cat([torch.zeros_like(agent), objects - objects.mean(0)], 1)
-    elif names == ["q_agent"]:
-        wanted["q_agent"][:, agent.shape[1] :] = 0
+    names, size = list(model.encoders), 2 * LATENT // len(model.encoders)
+    if space.arm is not None:  # beside the state, which pi's linear path sees
+        wanted = dict.fromkeys(names, course - _fitted(rows.start, course))
+    else:  # each its own part: with few motions what one tells of the other's is chance
+        of_agent, of_objects = (x - x.mean(0) for x in (agent, objects))
+        no_agent, no_objects = torch.zeros_like(agent), torch.zeros_like(objects)
+        parts = {"q_agent": (of_agent, no_objects), "q_environment": (no_agent, of_objects)}
+        wanted = {name: torch.cat(parts.get(name, (of_agent, of_objects)), 1) for name in names}
+    together = space.arm is not None and len(names) > 1  # by turns, each the rest that the other leaves
     z: dict[str, Tensor] = {}
     told = {name: torch.zeros_like(course) for name in names}
-    for _ in range(turns):
+    for _ in range(TURNS if together else 1):
         for name in names:
-            rest = wanted[name] - sum((told[k] for k in names if k != name and turns > 1), torch.zeros(()))
+            rest = wanted[name] - (sum(told[other] for other in names if other != name) if together else 0)
             _, _, directions = torch.linalg.svd(_fitted(rows.pooled[name], rest), full_matrices=False)
             z[name] = rest @ directions[:size].T
             told[name] = _fitted(rows.pooled[name], z[name]) @ directions[:size]
