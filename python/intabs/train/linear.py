@@ -24,7 +24,7 @@ POINTS = 12  # of the displacement's course that is compared
 NOT_HELD = -3.0  # logit
 QUIET = 0.1  # of the initial weights that the LSTMs' outputs keep
 TURNS = 8  # of z^r and z^e
-PUSH = 0.03  # rad, each joint, of half of the states
+PUSH, STIRS = 0.03, 1e-3  # rad: pushes of half of the states; joints that move by less in a tick are not pushed
 
 
 @torch.no_grad()
@@ -147,7 +147,8 @@ def _follow_state(
     for w, kept in zip(batches, keep, strict=True):
         now, n = w.state[:, :-1], w.within.sum(1)
         push = torch.from_numpy(rng.normal(size=(*now.agent.shape[:2], space.joints)).astype("f4"))
-        push = PUSH * push * torch.from_numpy((rng.random(now.agent.shape[:2]) < 0.5).astype("f4"))[..., None]
+        push = PUSH * push * (space.response_scale > STIRS)
+        push = push * torch.from_numpy((rng.random(now.agent.shape[:2]) < 0.5).astype("f4"))[..., None]
         aside = now.map(lambda v: v)
         aside.agent = torch.cat([now.agent[..., :-1] + push, now.agent[..., -1:]], -1)
         seen = space.features(aside)[0]
