@@ -83,7 +83,7 @@ def write_library(out: Path, library: dict) -> None:
 
 def practise(
     out: Path, library: dict, tries: range, jobs: int, progress, only: list[tuple[str, str]] | None = None
-) -> list[int]:
+) -> list[float]:
     """How often the skills of each demonstration do their task in the plant: truth, objects within PRACTICE_CM by
     turns, seeds of its own. only: of these (task, demonstration)."""
     write_library(out, library)
@@ -91,16 +91,16 @@ def practise(
     only = [c for c in only or chains if not c[1].endswith(AFAR)]
     work = [(Setting(task, str(out), PRACTICE_CM[i % 2], "truth", PRACTICE_SEED, "", source=source), i)
             for task, source in sorted(only) for i in tries]  # fmt: skip
-    won = dict.fromkeys(chains, 0)
+    won = dict.fromkeys(chains, 0.0)
     for done, ((setting, _), result) in enumerate(zip(work, in_processes(run_trial, work, jobs), strict=True)):
-        won[setting.task, setting.source] += result["success"]
+        won[setting.task, setting.source] += result["success"] / (1 + result["retries"])
         progress(done / len(work), f"{setting.task}: {setting.source}")
     for task, source in chains:  # as good as from near
         won[task, source] = won.get((task, source.removesuffix(AFAR)), 0)
     return list(won.values())
 
 
-def unsure(chains: list[tuple[str, str]], won: list[int], tries: int) -> list[tuple[str, str]]:
+def unsure(chains: list[tuple[str, str]], won: list[float], tries: int) -> list[tuple[str, str]]:
     """Where not even SURE demonstrations of a task always did it, the best ones: few tries hardly tell them apart."""
     out = []
     for task in dict.fromkeys(t for t, _ in chains):
@@ -252,7 +252,7 @@ def _write(
         again = practise(out, library, range(practice, MORE * practice), jobs, progress, more) if more else won
         library["practice"] = [
             {"task": c[0], "source": c[1], "trials": (MORE if c in more else 1) * practice,
-             "success": w + (a if c in more else 0)}
+             "success": round(w + (a if c in more else 0), 3)}
             for c, w, a in zip(chains, won, again, strict=True)
         ]  # fmt: skip
     write_library(out, library)
