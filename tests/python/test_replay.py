@@ -73,7 +73,7 @@ def poured():
     return recorded("pour")
 
 
-def test_what_is_lowered_into_a_bowl_goes_with_the_bowl_before(demo):
+def test_what_is_lowered_into_a_bowl_goes_with_the_bowl_before():
     """Else it comes down on the rim where the bowl lies elsewhere."""
     arm = _core.ArmModel.lite6()
     for name, stirred in recorded("stir"):

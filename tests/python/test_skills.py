@@ -16,7 +16,7 @@ from intabs.evaluate.metrics import sample  # noqa: E402
 from intabs.rollout import displaced_cm, rollout  # noqa: E402
 from intabs.skills.library import EFFECT, Frame, Library, drawing  # noqa: E402
 from intabs.skills.planner import Effect, Goal, Planner, goals_of, load_goals, missing, seen_from, whole  # noqa: E402
-from intabs.train.export import export, load_weights, unsure  # noqa: E402
+from intabs.train.export import export, load_weights, unsure, worth  # noqa: E402
 from intabs.train.trainer import Trainer, load_config  # noqa: E402
 
 
@@ -209,6 +209,15 @@ def test_where_practice_cannot_tell_the_best_try_more():
     # One that always did it may have been lucky.
     won[3] = won[4] = 3
     assert unsure(chains, won, 4) == [("a", "0"), ("a", "1"), ("b", "3"), ("b", "4"), ("b", "5"), ("b", "6")]
+
+
+def test_what_was_done_only_on_being_tried_again_is_worth_less():
+    assert [worth({"success": s, "retries": r}) for s, r in ((True, 0), (True, 1), (True, 3), (False, 0))] == [
+        1,
+        0.5,
+        0.25,
+        0,
+    ]
 
 
 def test_a_run_needs_a_scene(made, library):

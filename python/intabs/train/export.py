@@ -85,7 +85,7 @@ def practise(
     out: Path, library: dict, tries: range, jobs: int, progress, only: list[tuple[str, str]] | None = None
 ) -> list[float]:
     """How often the skills of each demonstration do their task in the plant: truth, objects within PRACTICE_CM by
-    turns, seeds of its own. only: of these (task, demonstration)."""
+    turns, seeds of its own; as `worth` has it. only: of these (task, demonstration)."""
     write_library(out, library)
     chains = list(Library.load(out).chains)
     only = [c for c in only or chains if not c[1].endswith(AFAR)]
@@ -93,11 +93,16 @@ def practise(
             for task, source in sorted(only) for i in tries]  # fmt: skip
     won = dict.fromkeys(chains, 0.0)
     for done, ((setting, _), result) in enumerate(zip(work, in_processes(run_trial, work, jobs), strict=True)):
-        won[setting.task, setting.source] += result["success"] / (1 + result["retries"])
+        won[setting.task, setting.source] += worth(result)
         progress(done / len(work), f"{setting.task}: {setting.source}")
     for task, source in chains:  # as good as from near
         won[task, source] = won.get((task, source.removesuffix(AFAR)), 0)
     return list(won.values())
+
+
+def worth(result: dict) -> float:
+    """Of a trial, 0 .. 1: what was done only on being tried again tells less for a demonstration's skills."""
+    return result["success"] / (1 + result["retries"])
 
 
 def unsure(chains: list[tuple[str, str]], won: list[float], tries: int) -> list[tuple[str, str]]:
