@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from test_learning import record
 
 pytest.importorskip("torch")
@@ -84,12 +85,16 @@ def test_what_is_lowered_into_a_bowl_goes_with_the_bowl_before():
         assert lowered.any() and about.to_other[np.argmax(lowered)] > 0.97, name
 
 
-def test_a_replay_that_the_command_filter_would_stop_is_not_tried(poured):
+def test_what_the_command_filter_would_stop_is_done_steeper_or_not_tried(poured, monkeypatch):
     """A cup so near the base that the hand cannot be level behind it."""
     replayer = Replayer("pour")
     name, demo = poured[5]
     about = outline(demo, replayer.arm)
-    assert name == "demo_36" and "too near" in replayer.replay(demo, about, 390005, 6.8, 0.0)
+    replay = replayer.replay(demo, about, 390005, 6.8, 0.0)
+    assert name == "demo_36" and not isinstance(replay, str), replay
+    assert replay.attrs["pitch"] > 0
+    monkeypatch.setattr(module, "PITCHES", (0.0,))
+    assert "too near" in replayer.replay(demo, about, 390005, 6.8, 0.0)
     session = replayer.session
     session.reset(390005, 6.8)
     path = replayer.commands(demo, about, session.observe()["object_pose"])
@@ -116,6 +121,31 @@ def test_a_bowl_may_be_come_to_from_another_side(poured):
     grasp = int(np.argmax(about.gripper))
     np.testing.assert_allclose(tip[0][: grasp + 1], tip[1][: grasp + 1], atol=1e-3)  # and taken as it was
     np.testing.assert_allclose(tip[0][-1, :3], tip[1][-1, :3], atol=0.02)  # and set down where it was
+
+
+def test_where_the_arm_cannot_come_as_recorded_the_hand_takes_it_steeper_or_flatter():
+    """As far as it must, on the same place of the handle, the fingers closing along the same line."""
+    replayer = Replayer("stir")
+    name, demo = recorded("stir")[0]
+    about = outline(demo, replayer.arm)
+    replayer.session.reset(390010, 10.0)
+    new = replayer.session.observe()["object_pose"]
+    assert name == "demo_40" and replayer.commands(demo, about, new) is None
+    path, pitch = replayer.way(demo, about, new, 0.0)
+    assert pitch == -0.2
+    grasp = int(np.argmax(about.gripper))
+    before, after = (np.asarray(replayer.arm.tip(q)) for q in (about.q_target[grasp], path[grasp]))
+    R = [Rotation.from_quat(np.roll(x[3:], -1)) for x in (before, after)]
+    step, yaw = displacement(demo.object_pose[0, about.mover], new[about.mover])
+    Rz = Rotation.from_rotvec([0, 0, yaw])
+    was = demo.object_pose[0, about.mover, :3]
+    np.testing.assert_allclose(after[:3], was + step + Rz.apply(before[:3] - was), atol=2e-3)
+    np.testing.assert_allclose(R[1].as_matrix()[:, 1], (Rz * R[0]).as_matrix()[:, 1], atol=1e-3)
+    assert ((Rz * R[0]).inv() * R[1]).as_rotvec() == pytest.approx([0, pitch, 0], abs=2e-3)
+    assert R[1].as_matrix()[2, 2] > R[0].as_matrix()[2, 2]  # flatter: it points down less
+    replay = replayer.replay(demo, about, 390010, 10.0, 0.0)
+    assert not isinstance(replay, str), replay
+    assert replay.attrs["pitch"] == pitch
 
 
 def test_replays_from_another_side_succeed_and_a_library_takes_the_one_most_like_its_recording(poured, tmp_path):

@@ -5,7 +5,8 @@ The tip's commanded path X(t) becomes D(t) X(t). D moves along with what the mot
 then with the object that will be moved (its displacement D_i), then, as it comes near another object, with that one's
 (D_j). Inverse kinematics gives the new commands. To what is round, a bowl, things may come from another side: if asked
 for, some replays turn the way there and back about its axis. After Mandlekar et al., MimicGen (2023), with references
-that go over into each other instead of cut pieces.
+that go over into each other instead of cut pieces. Where the arm cannot come to the object as recorded, the hand takes
+it steeper or flatter, turned about the axis along which the fingers close.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ ROUND = {("pour", 1)}  # task, slot: objects that things may come to from any si
 ANOTHER_SIDE = 1.1  # rad: about their axis by so much,
 SIDES = (-1, 0, 0, 0, 0, 1)  # this way or that, if asked for: most as recorded, or the cup is grasped less well
 NEAR_ROUND = 0.13  # m, moved object from the round one: there it has come round
+PITCHES = (0.0, 0.2, -0.2, 0.4, -0.4)  # rad: the hand steeper or flatter; the first that the arm can do
 
 
 @dataclass
@@ -167,9 +169,12 @@ class Replayer:
         self.arm = _core.ArmModel.lite6()
         self.ik = _core.IkSolver(self.arm)
 
-    def commands(self, demo: Demo, about: Outline, new: np.ndarray, side: float = 0.0) -> np.ndarray | None:
+    def commands(
+        self, demo: Demo, about: Outline, new: np.ndarray, side: float = 0.0, pitch: float = 0.0
+    ) -> np.ndarray | None:
         """Joint targets (T, 6) for objects at `new` (S, 7); None if they cannot be reached smoothly. side: angle about
-        the axis of what the moved object is brought to, from which it comes instead [rad]."""
+        the axis of what the moved object is brought to, from which it comes instead [rad]. pitch: of the hand about
+        the fingers' closing axis, its y axis, from the grasp on [rad]."""
         first = {
             i: demo.object_pose[np.argmax(demo.object_valid[:, i]), i] for i in (about.mover, about.other) if i >= 0
         }
@@ -187,7 +192,7 @@ class Replayer:
                 turned = Rotation.from_rotvec([0, 0, angle]).apply(p - first[i][:3])
                 shift = shift + weight * (first[i][:3] + step + turned - p)
                 yaw += weight * angle
-            turn, p = Rotation.from_rotvec([0, 0, yaw]) * R, p + shift
+            turn, p = Rotation.from_rotvec([0, 0, yaw]) * R * Rotation.from_rotvec([0, w * pitch, 0]), p + shift
             if side:
                 round_it, axis = Rotation.from_rotvec([0, 0, side * about.at_other[t]]), new[about.other, :3]
                 turn, p = round_it * turn, axis + round_it.apply(p - axis)
@@ -200,6 +205,18 @@ class Replayer:
             q = np.asarray(answer.q)
             out.append(q)
         return np.stack(out)
+
+    def way(self, demo: Demo, about: Outline, new: np.ndarray, side: float) -> tuple[np.ndarray, float] | str:
+        """(commands, pitch), of PITCHES the first that does; why if none does."""
+        why = "out of reach" + ", from another side" * bool(side)
+        for pitch in PITCHES:
+            path = self.commands(demo, about, new, side, pitch)
+            if path is None:
+                continue
+            if min(min(_core.arm_clearance(q)) for q in path[::LOOK]) >= -INTO_MARGIN:
+                return path, pitch
+            why = "the arm would come too near to itself or the table"
+        return why
 
     def replay(
         self,
@@ -222,12 +239,10 @@ class Replayer:
         session.reset(seed, spread_cm)
         rng = np.random.default_rng(seed)
         pose = session.observe()["object_pose"]
-        path = self.commands(demo, about, pose, side)
-        out_of_reach = "out of reach" + ", from another side" * bool(side)
-        if path is None:
-            return out_of_reach
-        if min(min(_core.arm_clearance(q)) for q in path[::LOOK]) < -INTO_MARGIN:
-            return "the arm would come too near to itself or the table"
+        way = self.way(demo, about, pose, side)
+        if isinstance(way, str):
+            return way
+        path, pitch = way
         slow = 0
         if at_grasp:
             there = path[: int(np.argmax(about.gripper)) + 1]
@@ -238,14 +253,14 @@ class Replayer:
             turned = (rotation(old).inv() * rotation(new[about.mover])).magnitude()
             if np.linalg.norm(new[about.mover, :3] - old[:3]) + TURN_LENGTH * turned > KNOCKED:
                 return "knocked away as the hand was put beside it"
-            path = self.commands(demo, about, new, side)
+            path = self.commands(demo, about, new, side, pitch)
             if path is None:
-                return out_of_reach
+                return "out of reach where it was knocked to"
         if start is not None:
             far = started_at(start, path, about, (1.0,))
             if far is None:
                 slow, about = SLOW, slowed(about, SLOW)
-                path = self.commands(demo, about, session.observe()["object_pose"], side)
+                path = self.commands(demo, about, session.observe()["object_pose"], side, pitch)
                 far = started_at(start, path, about, (1.0, 0.75, 0.5, 0.25, 0.0)) if path is not None else None
             if far is None or not self.drive(far[0]):
                 return "start out of reach"
@@ -269,7 +284,8 @@ class Replayer:
                 break
         if not session.success:
             return session.failure_reason.split(" [")[0]
-        how = {"seed": seed, "spread_cm": spread_cm, "side": side, "slow": slow, "approach": about.approach}
+        how = {"seed": seed, "spread_cm": spread_cm, "side": side, "pitch": pitch, "slow": slow}
+        how["approach"] = about.approach
         return Demo(*(np.array(x) for x in zip(*rows, strict=True)), how)
 
     def along(self, way: np.ndarray) -> bool:

@@ -125,7 +125,7 @@ def variants(data: dict, recorded: dict[str, Demo]) -> list[tuple[str, str, Demo
         return []
     if not Path(path).exists() or file_hash(path) != data["replays_sha256"]:
         raise UserError(f"{path}: not the replays of the training; skills are cut from those that go another way")
-    best: dict[tuple[str, float, int], tuple[tuple[bool, float], Demo]] = {}
+    best: dict[tuple[str, float, int], tuple[tuple[bool, float, float], Demo]] = {}
     with DemoFile(path) as f:
         for k in range(len(f)):
             attrs = f.own_attrs(k)
@@ -134,7 +134,7 @@ def variants(data: dict, recorded: dict[str, Demo]) -> list[tuple[str, str, Demo
                 continue
             replay = f.demo(k)
             elsewhere = np.abs(replay.joint_pos[0] - recorded[way[0]].joint_pos[0]).max() > SAME_START
-            rank = bool(elsewhere) and not way[2], float(attrs["spread_cm"])
+            rank = bool(elsewhere) and not way[2], abs(float(attrs.get("pitch", 0))), float(attrs["spread_cm"])
             if way not in best or rank < best[way][0]:
                 best[way] = rank, replay
     out = []
