@@ -133,8 +133,7 @@ def test_a_plan_does_not_lead_the_arm_through_what_it_does_not_concern(made, sce
     planner = Planner(made[0])
     goals = goals_of(planner.library, "pick_place", scene)
     plan = planner.find(goals, scene)
-    way = planner.head.run(scene.q, scene.gripper_closed, scene.object_pose, scene.known, [plan.arrays()[0]],
-                           [[s.ticks for s in plan.skills]])["q"][0]  # fmt: skip
+    way = made[1][0].joint_pos
     pose, known = scene.object_pose.copy(), scene.known.copy()
     known[2] = True  # a stranger
     effects = [e for e in planner.effects if e.chain == plan.skills]
@@ -144,6 +143,8 @@ def test_a_plan_does_not_lead_the_arm_through_what_it_does_not_concern(made, sce
         assert planner._meets(effects, there, way, np.repeat(pose[None], len(way), 0)) == meets
     effects[0].concerns.add(2)
     assert not planner._meets(effects, there, way, np.repeat(pose[None], len(way), 0))
+    down = way + np.linspace(0, 1, len(way))[:, None] * [0, 1.2, 0, 0, 0, 0]  # the shoulder leans into the table
+    assert planner._meets(effects, there, down, np.repeat(pose[None], len(way), 0))
 
 
 @pytest.mark.parametrize(

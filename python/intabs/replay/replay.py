@@ -25,6 +25,7 @@ from intabs.data.demos import OBJECT_SLOTS, Demo, DemoWriter
 from intabs.errors import UserError
 from intabs.jobs import in_processes
 from intabs.skills.library import TURN_LENGTH, rotation
+from intabs.skills.planner import too_near
 
 REACHED = 0.9  # of to_mover: the way to the object is over
 NEAR_GRASP = 0.08  # m, tip from the place where the object begins to move: there D is D_i
@@ -45,8 +46,6 @@ NEAR_HOME = 0.15  # so far from home (standard deviations, each joint); the othe
 START_RAD = 0.15
 SLOW = 40  # ticks more on the way to the object where a start is too far for the recording's pace
 DRIVE_STEP = 0.03  # rad a tick, on the way to such a start
-LOOK = 4  # ticks apart, where it is looked whether the command filter would stop the arm,
-INTO_MARGIN = 0.015  # m: so far inside its margin it often gets past
 KNOCKED = 0.015  # m (a turn counts TURN_LENGTH a radian): an object that moves so far as the hand is put beside it
 ROUND = {("pour", 1)}  # task, slot: objects that things may come to from any side,
 ANOTHER_SIDE = 1.1  # rad: about their axis by so much,
@@ -213,7 +212,7 @@ class Replayer:
             path = self.commands(demo, about, new, side, pitch)
             if path is None:
                 continue
-            if min(min(_core.arm_clearance(q)) for q in path[::LOOK]) >= -INTO_MARGIN:
+            if not too_near(path):
                 return path, pitch
             why = "the arm would come too near to itself or the table"
         return why

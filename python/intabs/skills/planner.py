@@ -29,7 +29,14 @@ BROUGHT_WITHIN = 0.12  # m: an object that ends so near another one was brought 
 CLEAR = 0.07  # m: an object that the arm's line passes so near is in the arm's way,
 IN_THE_WAY = 0.1  # m: and that counts as so much farther from the goal; leaving a task out counts more
 POURED_WITHIN = 0.16  # m: an object turned so near another one is poured into it
+LOOK = 4  # ticks apart, where it is looked whether the command filter would stop the arm,
+INTO_MARGIN = 0.015  # m: so far inside its margin it often gets past
 DONE = 0.03  # m (a turn counts TURN_LENGTH a radian): a wanted pose is reached
+
+
+def too_near(q: np.ndarray) -> bool:
+    """Whether the arm comes so near to itself or the table on its way (T, 6) that the command filter stops it."""
+    return min(min(_core.arm_clearance(x)) for x in q[::LOOK]) < -INTO_MARGIN
 
 
 @dataclass(frozen=True)
@@ -316,7 +323,10 @@ class Planner:
         )
 
     def _meets(self, sequence: list[Effect], seen: Frame, q: np.ndarray, object_pose: np.ndarray) -> bool:
-        """Whether the arm, at q (T, 6), comes on its way near an object that the chain it plays does not concern."""
+        """Whether the arm, at q (T, 6), comes on its way too near to itself or the table, or near an object that the
+        chain it plays does not concern."""
+        if too_near(q[: sum(s.ticks for e in sequence for s in e.chain)]):
+            return True
         at = 0
         for e in sequence:
             end = at + sum(s.ticks for s in e.chain)
