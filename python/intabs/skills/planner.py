@@ -24,6 +24,7 @@ from intabs.skills.library import SLOTS, TURN_LENGTH, Frame, Library, Skill, rot
 AS_GOOD = 0.15  # success in practice that is as good as another
 MOVES = 0.04  # m (a turn counts TURN_LENGTH a radian): an object that comes so far is moved by a chain
 CANDIDATES = 64  # verified, at most
+REMEMBERED = 64  # paths, by each chain
 UNPRACTISED = 0.05  # m: what a chain that never did its task in practice counts as farther from the goal
 BROUGHT_WITHIN = 0.12  # m: an object that ends so near another one was brought to it
 CLEAR = 0.07  # m: an object that the arm's line passes so near is in the arm's way,
@@ -140,6 +141,7 @@ class Effect:
 
     def __init__(self, chain: list[Skill]):
         self.chain = chain
+        self._told: dict[tuple[int, bytes], np.ndarray] = {}
         frames = [chain[0].frames[0], *(f for s in chain for f in s.frames[1:])]
         self.first, last = frames[0], frames[-1]
         self.path = np.stack([f.object_pose for f in frames])  # (F, 4, 7)
@@ -161,16 +163,25 @@ class Effect:
         """The objects' paths if they lie at pose (4, 7) now, (F, 4, 7)."""
         out = np.repeat(pose[None], len(self.path), 0)
         for i in self.moved:
-            at = self.brought_to.get(i, i)
+            out[:, i] = self._path(i, self.brought_to.get(i, i), pose)
+        if self.brought_to:
+            out[0] = pose
+        return out
+
+    def _path(self, i: int, at: int, pose: np.ndarray) -> np.ndarray:
+        """Of object i (F, 7), told from object `at`. A search asks for the same again and again."""
+        key = i, pose[at].tobytes()
+        if key not in self._told:
+            if len(self._told) >= REMEMBERED:
+                self._told.clear()
             old, new = self.path[0, at], pose[at]
             R = rotation(new) * rotation(old).inv()
             if at != i:  # brought to something: upright things stay upright
                 R = Rotation.from_rotvec([0, 0, R.as_rotvec()[2]])
-            out[:, i, :3] = new[:3] + R.apply(self.path[:, i, :3] - old[:3])
-            out[:, i, 3:] = np.roll((R * rotation(self.path[:, i])).as_quat(), 1, -1)
-        if self.brought_to:
-            out[0] = pose
-        return out
+            p = new[:3] + R.apply(self.path[:, i, :3] - old[:3])
+            q = np.roll((R * rotation(self.path[:, i])).as_quat(), 1, -1)
+            self._told[key] = np.concatenate([p, q], 1)
+        return self._told[key]
 
 
 def missing(goals: list[Goal], path: np.ndarray) -> tuple[float, int]:
@@ -269,8 +280,9 @@ class Planner:
     def _ranked(self, goals: list[Goal], seen: Frame, effects: list[Effect]) -> list[list[Effect]]:
         ranked = []
         first = {id(e): e.on(seen.object_pose) for e in effects}
+        begins = {id(e): _apart(e.chain, seen) for e in effects}
         for e in effects:
-            ranked.append((missing(goals, first[id(e)])[0], _apart(e.chain, seen), [e]))
+            ranked.append((missing(goals, first[id(e)])[0], begins[id(e)], [e]))
         if len({g.slot for g in goals}) > 1:
             named = {g.slot: k for k, g in reversed(list(enumerate(goals)))}  # slot -> its first goal
             turn = {id(e): min(named[i] for i in e.moved if i in named) for e in effects}
@@ -282,9 +294,8 @@ class Planner:
                     continue
                 path = first[id(a)]
                 more = b.on(path[-1])
-                apart = _apart(a.chain, seen) + _apart(
-                    b.chain, replace(seen, q=a.chain[-1].frames[-1].q, object_pose=path[-1])
-                )
+                there = replace(seen, q=a.chain[-1].frames[-1].q, object_pose=path[-1])
+                apart = begins[id(a)] + _apart(b.chain, there)
                 ranked.append((missing(goals, np.concatenate([path, more]))[0], apart, [a, b]))
         # Recordings that do as well as each other: rather the one that began as things are now.
         worth = {id(e): self.library.rate(e.chain) for e in effects}
