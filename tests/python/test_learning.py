@@ -340,12 +340,18 @@ def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not(data, tm
 def test_resuming_gives_the_weights_of_an_unbroken_run(data, tmp_path):
     whole = train(data, tmp_path / "whole").model.state_dict()
     train(data, tmp_path / "broken", stop_at=5)
+    log = tmp_path / "broken" / "log.jsonl"
+    log.write_text('{"step": 4, "of": "train"}\n{"step": 6, "of": "train"}\n{"step": 7, "of"')
     trainer = Trainer(load_config("intabs-small", SMALL), data, tmp_path / "broken", 0, "cpu")
     trainer.resume()
     assert trainer.step == 5
     trainer.train()
     resumed = trainer.model.state_dict()
     assert all(torch.equal(whole[k], resumed[k]) for k in whole)
+    # The log is that of the unbroken run too: nothing twice, nothing half.
+    lines = log.read_text().splitlines()
+    assert lines[0] == '{"step": 4, "of": "train"}'
+    assert lines[1:] == (tmp_path / "whole" / "log.jsonl").read_text().splitlines() and len(lines) > 1
 
 
 def test_a_run_goes_on_only_with_the_cuts_it_began_with(data, tmp_path):
@@ -433,6 +439,8 @@ def test_exported_weights_give_the_same_numbers_in_cpp(data, tmp_path):
     figures = export(tmp_path / "run", out, trials=0)
     assert figures["max_abs_error"] < 1e-5
     assert verify(out) == figures["max_abs_error"]
+    for name in ("log.jsonl", "result.json"):  # what the training was goes with them
+        assert (out / name).read_text() == (tmp_path / "run" / name).read_text() != ""
     errors = [figures["formats"][form]["rms_rad"] for form in ("fp32", "16", "8")]
     assert errors[0] < 1e-6 and errors[0] < errors[1] and errors[0] < errors[2] < 1e-3
     # The golden vectors can tell: other weights do not pass.

@@ -1,6 +1,7 @@
 """The skill library, plans and rollouts in the head, on weights trained for a few steps on recordings of the plant."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -16,7 +17,8 @@ from intabs.evaluate.metrics import sample  # noqa: E402
 from intabs.rollout import displaced_cm, rollout  # noqa: E402
 from intabs.skills.library import EFFECT, Frame, Library, drawing  # noqa: E402
 from intabs.skills.planner import Effect, Goal, Planner, goals_of, load_goals, missing, seen_from, whole  # noqa: E402
-from intabs.train.export import export, load_weights, unsure, worth  # noqa: E402
+from intabs.skills.practice import practise, unsure, worth  # noqa: E402
+from intabs.train.export import export, load_weights  # noqa: E402
 from intabs.train.trainer import Trainer, load_config  # noqa: E402
 
 
@@ -205,11 +207,11 @@ def test_displacement_is_that_of_the_farthest_object(library):
 
 def test_where_practice_cannot_tell_the_best_try_more():
     chains = [*(("a", str(k)) for k in range(3)), *(("b", str(k)) for k in range(3, 7)), ("c", "7"), ("d", "8")]
-    won = [3, 2, 1, 4, 4, 3, 4, 0, 4]
-    assert unsure(chains, won, 4) == [("a", "0"), ("a", "1")]
+    won = dict(zip(chains, [3, 2, 1, 4, 4, 3, 4, 0, 4], strict=True))
+    assert unsure(won, 4) == [("a", "0"), ("a", "1")]
     # One that always did it may have been lucky.
-    won[3] = won[4] = 3
-    assert unsure(chains, won, 4) == [("a", "0"), ("a", "1"), ("b", "3"), ("b", "4"), ("b", "5"), ("b", "6")]
+    won["b", "3"] = won["b", "4"] = 3
+    assert unsure(won, 4) == [("a", "0"), ("a", "1"), ("b", "3"), ("b", "4"), ("b", "5"), ("b", "6")]
 
 
 def test_what_was_done_only_on_being_tried_again_is_worth_less():
@@ -219,6 +221,47 @@ def test_what_was_done_only_on_being_tried_again_is_worth_less():
         0.25,
         0,
     ]
+
+
+def test_practice_is_noted_from_home_and_from_where_another_task_ended(tmp_path):
+    weights = tmp_path / "weights"
+    shutil.copytree(paths.MODELS / "weights" / "lite6", weights)
+    skills = json.loads((weights / "skills.json").read_text())
+    two = {("pick_place", "demo_1"), ("drawer_open", "demo_12")}
+    skills["skills"] = [s for s in skills["skills"] if (s["task"], s["source"]) in two]
+    (weights / "skills.json").write_text(json.dumps(skills))
+    shares = []
+    practise(weights, 1, 2, lambda share, text: shares.append(share))
+    noted = json.loads((weights / "skills.json").read_text())
+    assert noted["skills"] == skills["skills"] and max(shares) == 1
+    assert {(c["task"], c["source"]) for c in noted["practice"]} == two
+    after = {(c["task"], c["after"]): c["success"] / c["trials"] for c in noted["practice_after"]}
+    assert set(after) == {("pick_place", "drawer_open"), ("drawer_open", "pick_place")}
+    assert after["drawer_open", "pick_place"] > 0  # the arm comes there, and may command
+    library = Library.load(weights)
+    for chain in library.chains.values():
+        assert library.rate(chain, "pour") == library.rate(chain)  # nobody tried
+    # A sequence is worth what its second chain does after the first.
+    planner = Planner(weights)
+    drawer, pick = (next(e for e in planner.effects if e.chain[0].task == t) for t in ("drawer_open", "pick_place"))
+    library.practice["pick_place", "demo_1", "drawer_open"] = 0.5
+    planner.library = library
+    assert planner.rate([drawer, pick]) == pytest.approx(0.5 * library.rate(drawer.chain))
+    assert planner.rate([pick, drawer]) == library.rate(pick.chain) * library.rate(drawer.chain, "pick_place")
+
+
+def test_a_run_begins_where_the_arm_was_brought(made, library):
+    world = _core.Rollout(str(paths.MODELS), "pick_place", str(made[0]))
+    with pytest.raises(RuntimeError, match="reset"):
+        world.begin_at(np.zeros(6))
+    home = world.reset(3, 2.0)["q"]
+    there = home + np.array([0.5, 0.1, -0.1, 1.0, 0, 0])
+    np.testing.assert_allclose(world.begin_at(there)["q"], there, atol=0.01)
+    z, ticks, index = whole(library, "pick_place", None).arrays()
+    q = world.run(z[:1], ticks[:1], index[:1], 1, "policy")["q"]  # zeros: it stays
+    assert len(q) > ticks[0, 0]
+    np.testing.assert_allclose(q, np.tile(there, (len(q), 1)), atol=0.01)
+    assert world.begin_at(np.full(6, 9.0)) is None  # beyond the joints' limits
 
 
 def test_a_run_needs_a_scene(made, library):

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from intabs.errors import UserError
-from intabs.output import write_json
+from intabs.output import Progress, write_json
 
 Weights = Annotated[str, typer.Option(help="A name in models/weights, or a folder.")]
 Json = Annotated[Path | None, typer.Option(help="Write the figures there.")]
@@ -64,6 +64,33 @@ def register(app: typer.Typer) -> None:
             out.parent.mkdir(parents=True, exist_ok=True)
             out.write_text(drawing(s))
             print(f"wrote {out}")
+
+    @skills.command()
+    def practise(
+        weights: Annotated[Path, typer.Argument(help="Weights folder; its library is written anew.")],
+        tries: Annotated[int, typer.Option(help="Of each demonstration, more where that tells too little.", min=1)] = 6,
+        jobs: Annotated[int, typer.Option(help="Tries at a time.", min=1)] = 1,
+        json: Json = None,
+    ) -> None:
+        """Try the skills of each demonstration in the plant: plans are made of those that do their task."""
+        import numpy as np
+
+        from intabs.skills import practice
+        from intabs.skills.library import Library
+
+        Library.load(weights)  # before any work
+        with Progress("practise", total=1.0) as progress:
+            practice.practise(weights, tries, jobs, progress.update)
+        library = Library.load(weights)
+        figures = {}
+        for task in library.tasks:
+            starts = ["", *(t for t in library.tasks if t != task)]
+            rates = {a: [library.rate(c, a) for c in library.of_task(task)] for a in starts}
+            figures[task] = {a or "home": {"best": max(r), "mean": float(np.mean(r))} for a, r in rates.items()}
+        write_json(json, figures)
+        print("how often the best demonstration of a task did it (the mean of all), from home and after other tasks")
+        for task, f in figures.items():
+            print(f"  {task:12} " + "  ".join(f"{a} {r['best']:.2f} ({r['mean']:.2f})" for a, r in f.items()))
 
 
 def _figures(s) -> dict:

@@ -22,6 +22,7 @@ TURN_LENGTH = 0.1  # m/rad, as kTurnLength of skills/skill_player.h
 RESTS = 0.008  # m: an object that came less far in a skill rested
 EFFECT = 0.05  # m, as kEffect there
 MAX_SKILL_TICKS = 15000
+LOOSE = 0.07  # so much shorter or longer than recorded eta may make a skill (cpp/intabs/skills/README.md)
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,9 @@ def rotation(pose: np.ndarray) -> Rotation:
 
 class Library:
     """Skills in the file's order; `chains`: those of each demonstration, in time; `practice`: how often each chain
-    did its task when the exporter tried it in the plant, 0 .. 1 (1 where nobody tried)."""
+    (task, demonstration) did its task in practice, 0 .. 1, from home ("") or where another task had ended."""
 
-    def __init__(self, skills: list[Skill], practice: dict[tuple[str, str], float]):
+    def __init__(self, skills: list[Skill], practice: dict[tuple[str, str, str], float]):
         self.skills, self.practice = skills, practice
 
     @staticmethod
@@ -91,7 +92,10 @@ class Library:
             raise UserError(f"{path}: is missing; export the weights again")
         try:
             d = json.loads(path.read_text())
-            practice = {(c["task"], c["source"]): c["success"] / c["trials"] for c in d["practice"]}
+            practice = {
+                (c["task"], c["source"], c.get("after", "")): c["success"] / c["trials"]
+                for c in (*d["practice"], *d.get("practice_after", []))
+            }
             return Library([_skill(i, entry) for i, entry in enumerate(d["skills"])], practice)
         except (ValueError, KeyError, TypeError, IndexError, OverflowError, ZeroDivisionError) as e:
             raise UserError(
@@ -106,8 +110,15 @@ class Library:
             out.setdefault((s.task, s.source), []).append(s)
         return {k: sorted(v, key=lambda s: s.number) for k, v in out.items()}
 
-    def rate(self, chain: list[Skill]) -> float:
-        return self.practice.get((chain[0].task, chain[0].source), 1.0)
+    def rate(self, chain: list[Skill], after: str = "") -> float:
+        """How often it did its task in practice; where nobody tried it after that task, from home, else 1."""
+        task, source = chain[0].task, chain[0].source
+        return self.practice.get((task, source, after), self.practice.get((task, source, ""), 1.0))
+
+    @cached_property
+    def ends(self) -> dict[str, np.ndarray]:
+        """Where the arm stood as the demonstrations of each task ended, (n, 6) [rad]."""
+        return {task: np.array([c[-1].frames[-1].q for c in self.of_task(task)]) for task in self.tasks}
 
     @property
     def tasks(self) -> list[str]:
@@ -172,9 +183,8 @@ def _came(pose: np.ndarray) -> float:
 
 
 def _entry(task, source, number, z, a, b, moved, rested, q, gripper, object_pose, known) -> dict:
-    """Durations may be a sixth shorter or longer than recorded: with two fifths eta ended skills too early."""
     n = b - a
-    shortest = max(1, round(0.85 * n))
+    shortest = max(1, round((1 - LOOSE) * n))
 
     def frame(t: int) -> dict:
         objects = {str(i): [round(float(v), 4) for v in object_pose[t, i]] for i in np.flatnonzero(known[t])}

@@ -298,9 +298,13 @@ class Planner:
                 apart = begins[id(a)] + _apart(b.chain, there)
                 ranked.append((missing(goals, np.concatenate([path, more]))[0], apart, [a, b]))
         # Recordings that do as well as each other: rather the one that began as things are now.
-        worth = {id(e): self.library.rate(e.chain) for e in effects}
-        ranked.sort(key=lambda x: x[0] + 0.1 * min(x[1], 10.0) + UNPRACTISED * sum(1 - worth[id(e)] for e in x[2]))
+        ranked.sort(key=lambda x: x[0] + 0.1 * min(x[1], 10.0) + UNPRACTISED * (1 - self.rate(x[2])))
         return [x[2] for x in ranked]
+
+    def rate(self, sequence: list[Effect]) -> float:
+        """How often these, one after the other, would do it by what practice knows of each."""
+        before = ["", *(e.chain[0].task for e in sequence)]
+        return float(np.prod([self.library.rate(e.chain, after) for e, after in zip(sequence, before, strict=False)]))
 
     def for_task(self, task: str, seen: Frame) -> Plan:
         """The demonstration of it that began most like now; for tasks joined by +, which nobody demonstrated as a
@@ -321,7 +325,7 @@ class Planner:
             self._meets(sequence, seen, *way)
             for sequence, *way in zip(candidates, got["q"], got["object_pose"], strict=True)
         ]
-        rates = [np.prod([self.library.rate(e.chain) for e in sequence]) for sequence in candidates]
+        rates = [self.rate(sequence) for sequence in candidates]
         cost = np.array(left) + UNPRACTISED * (1 - np.array(rates)) + IN_THE_WAY * np.array(blocked)
         best = int(np.argmin(cost))
         return Plan(

@@ -22,24 +22,20 @@ from intabs.data.reader import DemoFile
 from intabs.errors import UserError
 from intabs.evaluate.learned import Learned
 from intabs.evaluate.metrics import fixed_cuts, sample
-from intabs.jobs import in_processes
 from intabs.model.networks import InteractionAbstractions, phase, phase_basis
 from intabs.model.space import Space, state_of
 from intabs.replay.replay import in_replay
 from intabs.rollout import UNSEEN, Setting, run_trial
-from intabs.skills.library import Library, entries
+from intabs.skills.library import entries
+from intabs.skills.practice import AFAR, note, tried, write
 from intabs.train.cutting import load_cutter
-from intabs.train.trainer import file_hash, load_model, load_named
+from intabs.train.trainer import LOG, RESULT, file_hash, load_model, load_named
 
 SCHEMA = 1
 STORED = {16: torch.float16, 32: torch.float32}
 SEGMENT = 14  # ticks of a skill on which the formats are compared
 GOLDEN_TICKS = 40
-PRACTICE_CM, PRACTICE_SEED = (3.0, 8.0), 500_000  # by turns: far away demonstrations differ in how well they do
-SURE = 3
 SAME_START = 0.05  # rad
-AFAR = " from afar"  # of a demonstration whose start is far away, where no practice begins
-MORE = 2  # times as many tries where it is not clear which demonstration does best
 TOLERANCE = 1e-5
 
 
@@ -74,46 +70,7 @@ def library_of(model, demos: list[Demo], names: list[str], cuts: list[list[int]]
         pose = np.pad(demo.object_pose, ((0, 0), (0, missing), (0, 0)))
         z, of = encode_demo(model, demo, at), (demo.joint_pos, demo.gripper > 0.5, pose, known)
         skills += entries(str(demo.attrs["task"]), name, z, at, *of)
-    return {"skills": skills, "practice": []}
-
-
-def write_library(out: Path, library: dict) -> None:
-    (out / "skills.json").write_text(json.dumps(library, separators=(",", ":")))
-
-
-def practise(
-    out: Path, library: dict, tries: range, jobs: int, progress, only: list[tuple[str, str]] | None = None
-) -> list[float]:
-    """How often the skills of each demonstration do their task in the plant: truth, objects within PRACTICE_CM by
-    turns, seeds of its own; as `worth` has it. only: of these (task, demonstration)."""
-    write_library(out, library)
-    chains = list(Library.load(out).chains)
-    only = [c for c in only or chains if not c[1].endswith(AFAR)]
-    work = [(Setting(task, str(out), PRACTICE_CM[i % 2], "truth", PRACTICE_SEED, "", source=source), i)
-            for task, source in sorted(only) for i in tries]  # fmt: skip
-    won = dict.fromkeys(chains, 0.0)
-    for done, ((setting, _), result) in enumerate(zip(work, in_processes(run_trial, work, jobs), strict=True)):
-        won[setting.task, setting.source] += worth(result)
-        progress(done / len(work), f"{setting.task}: {setting.source}")
-    for task, source in chains:  # as good as from near
-        won[task, source] = won.get((task, source.removesuffix(AFAR)), 0)
-    return list(won.values())
-
-
-def worth(result: dict) -> float:
-    """Of a trial, 0 .. 1: what was done only on being tried again tells less for a demonstration's skills."""
-    return result["success"] / (1 + result["retries"])
-
-
-def unsure(chains: list[tuple[str, str]], won: list[float], tries: int) -> list[tuple[str, str]]:
-    """Where not even SURE demonstrations of a task always did it, the best ones: few tries hardly tell them apart."""
-    out = []
-    for task in dict.fromkeys(t for t, _ in chains):
-        own = {c: w for c, w in zip(chains, won, strict=True) if c[0] == task}
-        best = max(own.values())
-        if sum(w == tries for w in own.values()) < min(SURE, len(own)):
-            out += [c for c, w in own.items() if w >= max(best - 1, 1)]
-    return out
+    return {"skills": skills, "practice": [], "practice_after": []}
 
 
 def variants(data: dict, recorded: dict[str, Demo]) -> list[tuple[str, str, Demo]]:
@@ -184,6 +141,9 @@ def export(
     partial.mkdir(parents=True)
     try:
         figures = _write(model, checkpoint, partial, trials, practice, jobs, progress, STORED[bits])
+        for name in (LOG, RESULT):
+            if (Path(run) / name).exists():
+                shutil.copy(Path(run) / name, partial / name)
         out.mkdir(exist_ok=True)
         for file in sorted(partial.iterdir()):
             os.replace(file, out / file.name)
@@ -244,23 +204,16 @@ def _write(
         names.append(name)
         demos.append(demo)
     even = [fixed_cuts(len(d), SEGMENT + 1) for d in demos]
+    chains = [(str(d.attrs["task"]), n) for d, n in zip(demos, names, strict=True)]
+    won = []
+    for kind in (even, cuts) if practice else ():
+        write(out / "skills.json", library_of(model, demos, names, kind))
+        won.append(tried(out, chains, range(practice), jobs, progress))
+    if practice:  # skills of a fixed length where they do better
+        cuts = [e if won[0][n] > won[1][n] else c for n, c, e in zip(chains, cuts, even, strict=True)]
+    write(out / "skills.json", library_of(model, demos, names, cuts))
     if practice:
-        tries = range(practice)
-        rates = [practise(out, library_of(model, demos, names, c), tries, jobs, progress) for c in (even, cuts)]
-        # Skills of a fixed length where they do better.
-        cuts = [e if a > b else c for a, b, c, e in zip(*rates, cuts, even, strict=True)]
-    library = library_of(model, demos, names, cuts)
-    if practice:
-        chains = [(str(d.attrs["task"]), n) for d, n in zip(demos, names, strict=True)]
-        won = [max(x) for x in zip(*rates, strict=True)]
-        more = unsure(chains, won, practice)
-        again = practise(out, library, range(practice, MORE * practice), jobs, progress, more) if more else won
-        library["practice"] = [
-            {"task": c[0], "source": c[1], "trials": (MORE if c in more else 1) * practice,
-             "success": round(w + (a if c in more else 0), 3)}
-            for c, w, a in zip(chains, won, again, strict=True)
-        ]  # fmt: skip
-    write_library(out, library)
+        note(out, {c: max(w[c] for w in won) for c in chains}, practice, jobs, progress)
 
     error = verify(out)
     if not error <= TOLERANCE:

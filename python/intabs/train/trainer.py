@@ -41,6 +41,8 @@ from intabs.train.windows import Windows, WindowSampler, disturbed, prepare
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 CHECKPOINT_EVERY = 500
 VALIDATE_EVERY = 250
+LOG = "log.jsonl"
+RESULT = "result.json"
 LOST, LOST_M = 1.0, 0.03  # a rollout so far from the demonstration [deviations of the training split; m] is given up
 PUSH_TICKS = 20  # by then a push has faded to a twelfth
 CUTS = 0.1  # weight of what `objective.cuts` adds [nat a tick]
@@ -131,16 +133,26 @@ def join_others(device: str) -> tuple[int, int, str]:
 
 
 class _Curves:
-    """TensorBoard."""
+    """TensorBoard; and LOG, one line of JSON an entry, which goes with exported weights."""
 
     def __init__(self, run: Path, step: int):
         from torch.utils.tensorboard import SummaryWriter
 
         self.writer = SummaryWriter(str(run), purge_step=step)
+        self.path = run / LOG
+        # What an interrupted run wrote after its last checkpoint comes again.
+        lines = self.path.read_text().splitlines(keepends=True) if step and self.path.exists() else []
+        self.path.write_text(
+            "".join(line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step)
+        )
 
     def add(self, group: str, values: dict, step: int) -> None:
+        values = {k: float(v) for k, v in values.items()}
         for k, v in values.items():
-            self.writer.add_scalar(f"{group}/{k}", float(v), step)
+            self.writer.add_scalar(f"{group}/{k}", v, step)
+        entry = {"step": step, "of": group} | {k: float(f"{v:.5g}") for k, v in values.items()}
+        with self.path.open("a") as f:
+            print(json.dumps(entry), file=f)
 
     def close(self) -> None:
         self.writer.close()
@@ -458,7 +470,7 @@ class Trainer:
             if patience and valid:
                 result["best_step"] = self.best[1]
                 os.replace(self.run / "best.pt", self.path)
-            (self.run / "result.json").write_text(json.dumps(result, indent=1))
+            (self.run / RESULT).write_text(json.dumps(result, indent=1))
         return result
 
     def _no_better(self, loss: float, patience: int) -> bool:
