@@ -81,18 +81,6 @@ class Rollout {
     return Observe(session_);
   }
 
-  // The arm begins there instead of at home. What is seen then; None: the driver did not let it.
-  py::object BeginAt(const JointVector& q) {
-    if (!reset_) throw std::runtime_error("reset() comes before begin_at()");
-    bool there;
-    {
-      py::gil_scoped_release release;
-      there = session_.Drive(q);
-      session_.LetGo();
-    }
-    return there ? py::object(Observe(session_)) : py::none();
-  }
-
   py::dict Run(const Array<float>& z, const Array<int>& ticks, const std::vector<int>& library_index, int settle_ticks,
                const std::string& ablate, bool nudge, int film_every, bool others) {
     if (!reset_) throw std::runtime_error("reset() comes before run(): each run begins in a scene of its own");
@@ -111,7 +99,7 @@ class Rollout {
       skills[i].min_ticks = *ticks.data(row, 0);
       skills[i].max_ticks = *ticks.data(row, 1);
     }
-    SkillController controller(player_, kSession + 1);
+    SkillController controller(player_, 1);
     controller.player().ZeroActions(ablate == "policy");
     controller.player().TryOthers(others);
     bool success = false;
@@ -303,12 +291,18 @@ void Bind_sim(py::module_& m) {
       .def(
           "command",
           [](Session& s, const JointVector& q_target, bool gripper_closed) {
+            ArmCommand c;
+            c.utime = s.status().utime;
+            c.seq = s.status().last_command_seq + 1;
+            c.session = 1;
+            c.status_seq = s.status().seq;
+            c.mode = ArmMode::kServo;
+            c.q_target = q_target;
+            c.gripper_closed = gripper_closed;
             py::gil_scoped_release release;
-            return static_cast<int>(s.Command(q_target, gripper_closed));
+            return static_cast<int>(s.Advance(c));
           },
           py::arg("q_target"), py::arg("gripper_closed"), "Answers this tick, goes on to the next. 0, or why it was refused.")
-      .def("drive", &Session::Drive, py::arg("q"), py::call_guard<py::gil_scoped_release>(),
-           "Joint by joint in step, the gripper as it is, to rest at q (6,) [rad]; whether the driver let it.")
       .def_property_readonly("success", [](const Session& s) { return s.world().Success(); })
       .def_property_readonly("failure_reason", [](const Session& s) { return s.world().FailureReason(); })
       .def_property_readonly("state_hash", [](const Session& s) { return s.world().StateHash(); });
@@ -318,8 +312,6 @@ void Bind_sim(py::module_& m) {
            py::arg("models_dir"), py::arg("task"), py::arg("weights_dir"), py::arg("perception_config") = "",
            py::arg("format") = "", "format of pi's weights: fp32, 16, 8; empty: the manifest's.")
       .def("reset", &Rollout::Reset, py::arg("seed"), py::arg("spread_cm"), "Starts over; what is seen then (Session.observe).")
-      .def("begin_at", &Rollout::BeginAt, py::arg("q"),
-           "Drives the arm to rest at joints q (6,) [rad] before run(). What is seen then, or None: the driver did not let it.")
       .def("run", &Rollout::Run, py::arg("z"), py::arg("ticks"), py::arg("library_index"), py::arg("settle_ticks") = 25,
            py::arg("ablate") = "", py::arg("nudge") = false, py::arg("film_every") = 0, py::arg("others") = true,
            "From where reset left it. z (n, 16); ticks (n, 2): shortest and longest duration; library_index: n numbers, -1: a\n"

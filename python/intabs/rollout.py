@@ -37,7 +37,6 @@ class Setting:
     plan: str = ""  # as Planner.for_task; "whole": the demonstration that began most like now; "goal": found
     nudge: bool = False  # the first grasp is made to fail
     source: str = ""  # plays this demonstration's skills
-    after: str = ""  # the arm begins where a demonstration of this task ended, by turns
     film: str = ""  # folder for a strip of pictures of each failure
 
 
@@ -79,11 +78,7 @@ def _run_trial(setting: Setting, trial: int) -> dict:
         _cache[key] = world, planner
     world, planner = _cache[key]
     seed = setting.seed + trial
-    observed = world.reset(seed, setting.spread)
-    if setting.after:
-        ends = planner.library.ends[setting.after]
-        observed = world.begin_at(ends[trial % len(ends)]) or observed  # where the driver did not let it: from there
-    seen = seen_from(observed)
+    seen = seen_from(world.reset(seed, setting.spread))
     if setting.plan == "goal":
         plan = planner.find(goals_of(planner.library, setting.task, seen), seen)
     elif setting.plan == "whole" or setting.source:

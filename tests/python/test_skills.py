@@ -16,7 +16,19 @@ from intabs.errors import UserError  # noqa: E402
 from intabs.evaluate.metrics import sample  # noqa: E402
 from intabs.rollout import displaced_cm, rollout  # noqa: E402
 from intabs.skills.library import EFFECT, Frame, Library, drawing  # noqa: E402
-from intabs.skills.planner import Effect, Goal, Planner, goals_of, load_goals, missing, seen_from, whole  # noqa: E402
+from intabs.skills.planner import (  # noqa: E402
+    IN_THE_WAY,
+    PRESSED,
+    PRESSED_FROM,
+    Effect,
+    Goal,
+    Planner,
+    goals_of,
+    load_goals,
+    missing,
+    seen_from,
+    whole,
+)  # fmt: skip
 from intabs.skills.practice import practise, unsure, worth  # noqa: E402
 from intabs.train.export import export, load_weights  # noqa: E402
 from intabs.train.trainer import Trainer, load_config  # noqa: E402
@@ -142,11 +154,20 @@ def test_a_plan_does_not_lead_the_arm_through_what_it_does_not_concern(made, sce
     for offset, meets in (([0, 0, 0.5], False), ([0, 0, 0.03], True)):
         pose[2, :3] = planner.arm.tip(way[len(way) // 2])[:3] + offset
         there = Frame(scene.q, scene.gripper_closed, pose, known)
-        assert planner._meets(effects, there, way, np.repeat(pose[None], len(way), 0)) == meets
+        assert (planner._meets(effects, there, way, np.repeat(pose[None], len(way), 0)) == IN_THE_WAY) == meets
     effects[0].concerns.add(2)
-    assert not planner._meets(effects, there, way, np.repeat(pose[None], len(way), 0))
+    assert planner._meets(effects, there, way, np.repeat(pose[None], len(way), 0)) != IN_THE_WAY
     down = way + np.linspace(0, 1, len(way))[:, None] * [0, 1.2, 0, 0, 0, 0]  # the shoulder leans into the table
-    assert planner._meets(effects, there, down, np.repeat(pose[None], len(way), 0))
+    assert planner._meets(effects, there, down, np.repeat(pose[None], len(way), 0)) == IN_THE_WAY
+    # The hand comes to where the block's middle is, nearer than any recording: it would push it away.
+    pose[0, :3] = planner.arm.tip(way[len(way) // 2])[:3]
+    near = planner.near[id(effects[0])][0]
+    assert near > 0.02
+    assert planner._meets(effects, there, way, np.repeat(pose[None], len(way), 0)) == pytest.approx(
+        PRESSED * (near - PRESSED_FROM)
+    )
+    pose[0, :3] += [0, 0, 1.0]
+    assert planner._meets(effects, there, way, np.repeat(pose[None], len(way), 0)) == 0
 
 
 @pytest.mark.parametrize(
@@ -223,45 +244,26 @@ def test_what_was_done_only_on_being_tried_again_is_worth_less():
     ]
 
 
-def test_practice_is_noted_from_home_and_from_where_another_task_ended(tmp_path):
+def test_practice_is_noted_in_the_library_and_plans_are_made_by_it(tmp_path):
     weights = tmp_path / "weights"
     shutil.copytree(paths.MODELS / "weights" / "lite6", weights)
     skills = json.loads((weights / "skills.json").read_text())
-    two = {("pick_place", "demo_1"), ("drawer_open", "demo_12")}
+    two = [("pick_place", "demo_1"), ("drawer_open", "demo_12")]
     skills["skills"] = [s for s in skills["skills"] if (s["task"], s["source"]) in two]
+    skills["practice"] = [{"task": t, "source": s, "trials": 1, "success": 0} for t, s in two]
     (weights / "skills.json").write_text(json.dumps(skills))
     shares = []
     practise(weights, 1, 2, lambda share, text: shares.append(share))
     noted = json.loads((weights / "skills.json").read_text())
     assert noted["skills"] == skills["skills"] and max(shares) == 1
-    assert {(c["task"], c["source"]) for c in noted["practice"]} == two
-    after = {(c["task"], c["after"]): c["success"] / c["trials"] for c in noted["practice_after"]}
-    assert set(after) == {("pick_place", "drawer_open"), ("drawer_open", "pick_place")}
-    assert after["drawer_open", "pick_place"] > 0  # the arm comes there, and may command
-    library = Library.load(weights)
-    for chain in library.chains.values():
-        assert library.rate(chain, "pour") == library.rate(chain)  # nobody tried
-    # A sequence is worth what its second chain does after the first.
+    assert [(c["task"], c["source"]) for c in noted["practice"]] == two
+    assert all(c["success"] > 0 for c in noted["practice"])
+    # To leave one of two out is no gain, whatever practice says of it.
     planner = Planner(weights)
-    drawer, pick = (next(e for e in planner.effects if e.chain[0].task == t) for t in ("drawer_open", "pick_place"))
-    library.practice["pick_place", "demo_1", "drawer_open"] = 0.5
-    planner.library = library
-    assert planner.rate([drawer, pick]) == pytest.approx(0.5 * library.rate(drawer.chain))
-    assert planner.rate([pick, drawer]) == library.rate(pick.chain) * library.rate(drawer.chain, "pick_place")
-
-
-def test_a_run_begins_where_the_arm_was_brought(made, library):
-    world = _core.Rollout(str(paths.MODELS), "pick_place", str(made[0]))
-    with pytest.raises(RuntimeError, match="reset"):
-        world.begin_at(np.zeros(6))
-    home = world.reset(3, 2.0)["q"]
-    there = home + np.array([0.5, 0.1, -0.1, 1.0, 0, 0])
-    np.testing.assert_allclose(world.begin_at(there)["q"], there, atol=0.01)
-    z, ticks, index = whole(library, "pick_place", None).arrays()
-    q = world.run(z[:1], ticks[:1], index[:1], 1, "policy")["q"]  # zeros: it stays
-    assert len(q) > ticks[0, 0]
-    np.testing.assert_allclose(q, np.tile(there, (len(q), 1)), atol=0.01)
-    assert world.begin_at(np.full(6, 9.0)) is None  # beyond the joints' limits
+    planner.library.practice = {two[0]: 0.5, two[1]: 1.0}
+    pick, drawer = (next(e for e in planner.effects if e.chain[0].task == t) for t, _ in two)
+    assert planner.unpractised([drawer]) == 0
+    assert planner.unpractised([pick]) == 2 * planner.unpractised([pick, drawer]) > 0
 
 
 def test_a_run_needs_a_scene(made, library):
@@ -283,5 +285,5 @@ def test_what_concerns_one_object_is_done_in_the_order_asked_for(task, orders):
     session.reset(3, 2.0)
     seen = seen_from(session.observe())
     found = planner.search(goals_of(planner.library, task, seen), seen)
-    pairs = {tuple(e.chain[0].task for e in sequence) for sequence in found if len(sequence) == 2}
+    pairs = {tuple(e.chain[0].task for e in c.sequence) for c in found if len(c.sequence) == 2}
     assert orders <= pairs and (len(orders) == 2 or ("stir", "pour") not in pairs)

@@ -1,12 +1,8 @@
 #include "intabs/sim/session.h"
 
-#include <cmath>
-
 namespace intabs {
 namespace {
 constexpr int kTicksPerPolicyTick = static_cast<int>(kPolicyPeriodUs / kDriverPeriodUs);
-constexpr double kDriveStep = 0.03;  // [rad] a policy tick
-constexpr int kDriveRest = 10;       // policy ticks
 }
 
 Session::Session(const std::string& models_dir, const std::string& task, std::optional<PerceptionConfig> perception)
@@ -26,41 +22,9 @@ void Session::Reset(int64_t seed, double spread_cm) {
 
 Refusal Session::Advance(const ArmCommand& command) {
   const Refusal refusal = sim_.Accept(command);
-  Tick();
-  return refusal;
-}
-
-Refusal Session::Command(const JointVector& q_target, bool gripper_closed) {
-  ArmCommand c;
-  c.utime = status_.utime;
-  c.seq = status_.last_command_seq + 1;
-  c.session = kSession;
-  c.status_seq = status_.seq;
-  c.mode = ArmMode::kServo;
-  c.q_target = q_target;
-  c.gripper_closed = gripper_closed;
-  return Advance(c);
-}
-
-bool Session::Drive(const JointVector& to) {
-  const JointVector from = status_.q_commanded;
-  const bool gripper = status_.gripper_closed;
-  const int steps = static_cast<int>(std::ceil((to - from).cwiseAbs().maxCoeff() / kDriveStep)) + 1;
-  for (int k = 1; k <= steps + kDriveRest; ++k) {
-    const JointVector target = k < steps ? JointVector(from + (to - from) * k / steps) : to;
-    if (Command(target, gripper) != Refusal::kAccepted) return false;
-  }
-  return true;
-}
-
-void Session::LetGo() {
-  const auto obeys = [&] { return status_.state == ArmState::kAligning || status_.state == ArmState::kTracking; };
-  while (obeys() || status_.state == ArmState::kSlowing) Tick();
-}
-
-void Session::Tick() {
   for (int i = 0; i < kTicksPerPolicyTick; ++i) sim_.Tick();
   Look();
+  return refusal;
 }
 
 void Session::Look() {

@@ -13,9 +13,6 @@
 
 namespace intabs {
 
-// Commands what Session makes itself.
-inline constexpr int64_t kSession = 1;
-
 class Session {
  public:
   // perception: poses come from rendered tags; absent: from the plant's truth. Throws on an unknown task.
@@ -27,14 +24,6 @@ class Session {
   // Answers the current policy tick and goes on to the next one, 40 ms later.
   Refusal Advance(const ArmCommand& command);
 
-  // The same with these targets, as kSession.
-  Refusal Command(const JointVector& q_target, bool gripper_closed);
-
-  // Joint by joint in step, the gripper as it is, to rest at these joints [rad]; false: the driver did not let it.
-  bool Drive(const JointVector& to);
-  // Until its last command lapses: from then on the arm obeys another session.
-  void LetGo();
-
   // See World::Nudge.
   void Nudge(int slot, const Eigen::Vector3d& dp_W) { sim_.Nudge(slot, dp_W); }
 
@@ -43,7 +32,6 @@ class Session {
   const World& world() const { return sim_.world(); }
 
  private:
-  void Tick();
   void Look();
 
   ArmSim sim_;

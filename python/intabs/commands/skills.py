@@ -82,15 +82,12 @@ def register(app: typer.Typer) -> None:
         with Progress("practise", total=1.0) as progress:
             practice.practise(weights, tries, jobs, progress.update)
         library = Library.load(weights)
-        figures = {}
-        for task in library.tasks:
-            starts = ["", *(t for t in library.tasks if t != task)]
-            rates = {a: [library.rate(c, a) for c in library.of_task(task)] for a in starts}
-            figures[task] = {a or "home": {"best": max(r), "mean": float(np.mean(r))} for a, r in rates.items()}
+        rates = {task: [library.rate(c) for c in library.of_task(task)] for task in library.tasks}
+        figures = {task: {"best": max(r), "mean": float(np.mean(r)), "chains": len(r)} for task, r in rates.items()}
         write_json(json, figures)
-        print("how often the best demonstration of a task did it (the mean of all), from home and after other tasks")
+        print("task          best  mean  of demonstrations")
         for task, f in figures.items():
-            print(f"  {task:12} " + "  ".join(f"{a} {r['best']:.2f} ({r['mean']:.2f})" for a, r in f.items()))
+            print(f"{task:12}  {f['best']:.2f}  {f['mean']:.2f}  {f['chains']:3d}")
 
 
 def _figures(s) -> dict:

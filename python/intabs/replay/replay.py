@@ -45,6 +45,7 @@ BESIDE_RAD = 0.03
 NEAR_HOME = 0.15  # so far from home (standard deviations, each joint); the others at home
 START_RAD = 0.15
 SLOW = 40  # ticks more on the way to the object where a start is too far for the recording's pace
+DRIVE_STEP = 0.03  # rad a tick, on the way to such a start
 KNOCKED = 0.015  # m (a turn counts TURN_LENGTH a radian): an object that moves so far as the hand is put beside it
 ROUND = {("pour", 1)}  # task, slot: objects that things may come to from any side,
 ANOTHER_SIDE = 1.1  # rad: about their axis by so much,
@@ -245,7 +246,7 @@ class Replayer:
         if at_grasp:
             there = path[: int(np.argmax(about.gripper)) + 1]
             start = there[-1] + start
-            if not (self.along(there) and self.session.drive(start)):
+            if not (self.along(there) and self.drive(start)):
                 return "start out of reach"
             old, new = pose[about.mover], session.observe()["object_pose"]  # what was touched lies elsewhere
             turned = (rotation(old).inv() * rotation(new[about.mover])).magnitude()
@@ -260,7 +261,7 @@ class Replayer:
                 slow, about = SLOW, slowed(about, SLOW)
                 path = self.commands(demo, about, session.observe()["object_pose"], side, pitch)
                 far = started_at(start, path, about, (1.0, 0.75, 0.5, 0.25, 0.0)) if path is not None else None
-            if far is None or not self.session.drive(far[0]):
+            if far is None or not self.drive(far[0]):
                 return "start out of reach"
             path = far
         rows, pushed, target = [], np.zeros(6), path[0].copy()
@@ -289,6 +290,14 @@ class Replayer:
     def along(self, way: np.ndarray) -> bool:
         """By these targets (n, 6), the gripper open; whether the driver let it."""
         return all(self.session.command(target, False) == 0 for target in way)
+
+    def drive(self, to: np.ndarray) -> bool:
+        """Joint by joint in step, to rest there; whether the driver let it."""
+        o = self.session.observe()
+        q, gripper = np.asarray(o["q_commanded"]), bool(o["gripper_closed"])
+        steps = int(np.ceil(np.abs(to - q).max() / DRIVE_STEP)) + 1
+        way = [q + (to - q) * (k + 1) / steps for k in range(steps)] + [to] * 10
+        return all(self.session.command(target, gripper) == 0 for target in way)
 
 
 def pad_slots(demo: Demo) -> Demo:

@@ -78,9 +78,9 @@ def rotation(pose: np.ndarray) -> Rotation:
 
 class Library:
     """Skills in the file's order; `chains`: those of each demonstration, in time; `practice`: how often each chain
-    (task, demonstration) did its task in practice, 0 .. 1, from home ("") or where another task had ended."""
+    (task, demonstration) did its task in practice, 0 .. 1 (1 where nobody tried)."""
 
-    def __init__(self, skills: list[Skill], practice: dict[tuple[str, str, str], float]):
+    def __init__(self, skills: list[Skill], practice: dict[tuple[str, str], float]):
         self.skills, self.practice = skills, practice
 
     @staticmethod
@@ -92,10 +92,7 @@ class Library:
             raise UserError(f"{path}: is missing; export the weights again")
         try:
             d = json.loads(path.read_text())
-            practice = {
-                (c["task"], c["source"], c.get("after", "")): c["success"] / c["trials"]
-                for c in (*d["practice"], *d.get("practice_after", []))
-            }
+            practice = {(c["task"], c["source"]): c["success"] / c["trials"] for c in d["practice"]}
             return Library([_skill(i, entry) for i, entry in enumerate(d["skills"])], practice)
         except (ValueError, KeyError, TypeError, IndexError, OverflowError, ZeroDivisionError) as e:
             raise UserError(
@@ -110,15 +107,8 @@ class Library:
             out.setdefault((s.task, s.source), []).append(s)
         return {k: sorted(v, key=lambda s: s.number) for k, v in out.items()}
 
-    def rate(self, chain: list[Skill], after: str = "") -> float:
-        """How often it did its task in practice; where nobody tried it after that task, from home, else 1."""
-        task, source = chain[0].task, chain[0].source
-        return self.practice.get((task, source, after), self.practice.get((task, source, ""), 1.0))
-
-    @cached_property
-    def ends(self) -> dict[str, np.ndarray]:
-        """Where the arm stood as the demonstrations of each task ended, (n, 6) [rad]."""
-        return {task: np.array([c[-1].frames[-1].q for c in self.of_task(task)]) for task in self.tasks}
+    def rate(self, chain: list[Skill]) -> float:
+        return self.practice.get((chain[0].task, chain[0].source), 1.0)
 
     @property
     def tasks(self) -> list[str]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -23,12 +22,17 @@ from intabs.skills.library import SLOTS, TURN_LENGTH, Frame, Library, Skill, rot
 
 AS_GOOD = 0.15  # success in practice that is as good as another
 MOVES = 0.04  # m (a turn counts TURN_LENGTH a radian): an object that comes so far is moved by a chain
-CANDIDATES = 64  # verified, at most
+CANDIDATES = 64  # verified, at most,
+KEPT = 2  # beginnings with all that goes on from them
 REMEMBERED = 64  # paths, by each chain
-UNPRACTISED = 0.05  # m: what a chain that never did its task in practice counts as farther from the goal
+UNPRACTISED = 0.2  # m: what a chain that never did its task in practice counts as farther from the goal
+APART = 0.1  # of how differently its recordings began counts likewise
+HOPELESS = 0.07  # m: what by the recordings ends so much farther from the goal than the best is not tried in the head
 BROUGHT_WITHIN = 0.12  # m: an object that ends so near another one was brought to it
 CLEAR = 0.07  # m: an object that the arm's line passes so near is in the arm's way,
 IN_THE_WAY = 0.1  # m: and that counts as so much farther from the goal; leaving a task out counts more
+PRESSED = 8.0  # what comes nearer than recorded to what is grasped, by more than
+PRESSED_FROM = 0.012  # m, counts so many times as farther from the goal: beyond 15 mm a cup is always pushed away
 POURED_WITHIN = 0.16  # m: an object turned so near another one is poured into it
 LOOK = 4  # ticks apart, where it is looked whether the command filter would stop the arm,
 INTO_MARGIN = 0.015  # m: so far inside its margin it often gets past
@@ -144,6 +148,7 @@ class Effect:
         self._told: dict[tuple[int, bytes], np.ndarray] = {}
         frames = [chain[0].frames[0], *(f for s in chain for f in s.frames[1:])]
         self.first, last = frames[0], frames[-1]
+        self.q = np.stack([f.q for f in frames])  # (F, 6)
         self.path = np.stack([f.object_pose for f in frames])  # (F, 4, 7)
         far = np.linalg.norm(self.path[..., :3] - self.path[0, :, :3], axis=-1).max(0)
         turn = np.array([_turns(self.path[:, i]).max() for i in range(SLOTS)])
@@ -248,6 +253,14 @@ def load_goals(path: Path) -> list[Goal]:
     return out
 
 
+@dataclass(frozen=True)
+class Candidate:
+    """Chains one after the other."""
+
+    sequence: list[Effect]
+    doubt: float  # what counts as farther from the goal, as practice and where its recordings began have it [m]
+
+
 class Planner:
     """Finds plans for goals. Allocates the rollouts once."""
 
@@ -256,9 +269,14 @@ class Planner:
         self.effects = [Effect(chain) for chain in self.library.chains.values()]
         self.head = _core.KinematicRollout(str(weights), CANDIDATES)
         self.arm = _core.ArmModel.lite6()
+        # How near the arm comes to what it moves in the recording [m].
+        self.near = {
+            id(e): {i: self.arm.distance_from(e.q, e.path[:, i, :3]).min() for i in e.moved} for e in self.effects
+        }
 
-    def search(self, goals: list[Goal], seen: Frame) -> list[list[Effect]]:
-        """The most promising sequences of chains, by their recordings; no longer than there are objects to be moved."""
+    def search(self, goals: list[Goal], seen: Frame) -> list[Candidate]:
+        """Sequences of chains, the most promising by their recordings first; no longer than there are objects to be
+        moved."""
         unknown = [g.slot for g in goals if not seen.known[g.slot]]
         if unknown:
             raise UserError(f"the goal names object {unknown[0]}, which is not seen")
@@ -269,20 +287,14 @@ class Planner:
         found = self._ranked(goals, seen, tidy or able)
         if not found:
             raise UserError("no demonstration moves what the goal names")
-        # Rather many beginnings than one with all its continuations: what the arm meets is only seen in the head.
-        seen_before: Counter[int] = Counter()
-        turn = []
-        for sequence in found:
-            turn.append(seen_before[id(sequence[0])])
-            seen_before[id(sequence[0])] += 1
-        return [found[k] for k in sorted(range(len(found)), key=turn.__getitem__)[:CANDIDATES]]
+        return found
 
-    def _ranked(self, goals: list[Goal], seen: Frame, effects: list[Effect]) -> list[list[Effect]]:
-        ranked = []
+    def _ranked(self, goals: list[Goal], seen: Frame, effects: list[Effect]) -> list[Candidate]:
+        found = []
         first = {id(e): e.on(seen.object_pose) for e in effects}
         begins = {id(e): _apart(e.chain, seen) for e in effects}
         for e in effects:
-            ranked.append((missing(goals, first[id(e)])[0], begins[id(e)], [e]))
+            found.append((missing(goals, first[id(e)])[0], begins[id(e)], [e]))
         if len({g.slot for g in goals}) > 1:
             named = {g.slot: k for k, g in reversed(list(enumerate(goals)))}  # slot -> its first goal
             turn = {id(e): min(named[i] for i in e.moved if i in named) for e in effects}
@@ -296,15 +308,17 @@ class Planner:
                 more = b.on(path[-1])
                 there = replace(seen, q=a.chain[-1].frames[-1].q, object_pose=path[-1])
                 apart = begins[id(a)] + _apart(b.chain, there)
-                ranked.append((missing(goals, np.concatenate([path, more]))[0], apart, [a, b]))
+                found.append((missing(goals, np.concatenate([path, more]))[0], apart, [a, b]))
         # Recordings that do as well as each other: rather the one that began as things are now.
-        ranked.sort(key=lambda x: x[0] + 0.1 * min(x[1], 10.0) + UNPRACTISED * (1 - self.rate(x[2])))
-        return [x[2] for x in ranked]
+        ranked = [(left, Candidate(e, APART * min(apart, 10.0) + self.unpractised(e))) for left, apart, e in found]
+        ranked.sort(key=lambda x: x[0] + x[1].doubt)
+        best = ranked[0][0] + ranked[0][1].doubt if ranked else 0.0
+        return [c for left, c in ranked if left + c.doubt < best + HOPELESS]
 
-    def rate(self, sequence: list[Effect]) -> float:
-        """How often these, one after the other, would do it by what practice knows of each."""
-        before = ["", *(e.chain[0].task for e in sequence)]
-        return float(np.prod([self.library.rate(e.chain, after) for e, after in zip(sequence, before, strict=False)]))
+    def unpractised(self, sequence: list[Effect]) -> float:
+        """What counts as farther from the goal for what its chains did not do in practice [m]. The mean: leaving a task
+        out must not make a plan better."""
+        return UNPRACTISED * float(np.mean([1 - self.library.rate(e.chain) for e in sequence]))
 
     def for_task(self, task: str, seen: Frame) -> Plan:
         """The demonstration of it that began most like now; for tasks joined by +, which nobody demonstrated as a
@@ -313,42 +327,62 @@ class Planner:
 
     def find(self, goals: list[Goal], seen: Frame) -> Plan:
         began = time.perf_counter()
-        candidates = self.search(goals, seen)
+        found = self.search(goals, seen)
         searched = time.perf_counter()
-        plans = [[s for e in sequence for s in e.chain] for sequence in candidates]
-        got = self.head.run(
-            seen.q, seen.gripper_closed, seen.object_pose, seen.known,
-            [np.stack([s.z for s in p]) for p in plans], [[s.ticks for s in p] for p in plans],
-        )  # fmt: skip
-        left = [missing(goals, path)[0] for path in got["object_pose"]]
-        blocked = [
-            self._meets(sequence, seen, *way)
-            for sequence, *way in zip(candidates, got["q"], got["object_pose"], strict=True)
-        ]
-        rates = [self.rate(sequence) for sequence in candidates]
-        cost = np.array(left) + UNPRACTISED * (1 - np.array(rates)) + IN_THE_WAY * np.array(blocked)
+        # What the arm meets, and where pi misses, is only seen in the head: first each beginning with what seems to go
+        # on from it best, then the best beginnings with all that goes on from them.
+        begin = {id(c.sequence[0]): c for c in reversed(found)}
+        tried = sorted(begin.values(), key=found.index)[: CANDIDATES // 2]
+        cost, ends, left = self._in_the_head(tried, goals, seen)
+        kept = {id(tried[k].sequence[0]) for k in np.argsort(cost)[:KEPT]}
+        known = {id(c) for c in tried}
+        more = [c for c in found if id(c.sequence[0]) in kept and id(c) not in known][: CANDIDATES - len(tried)]
+        if more:
+            cost, ends, left = (
+                np.concatenate(x) for x in zip((cost, ends, left), self._in_the_head(more, goals, seen), strict=True)
+            )
         best = int(np.argmin(cost))
+        sequence = (tried + more)[best].sequence
         return Plan(
-            plans[best],
-            ", ".join(f"{e.chain[0].task}: {e.chain[0].source}" for e in candidates[best]),
-            got["object_pose"][best, -1],
-            left[best],
+            [s for e in sequence for s in e.chain],
+            ", ".join(f"{e.chain[0].task}: {e.chain[0].source}" for e in sequence),
+            ends[best],
+            float(left[best]),
             searched - began,
             time.perf_counter() - searched,
         )
 
-    def _meets(self, sequence: list[Effect], seen: Frame, q: np.ndarray, object_pose: np.ndarray) -> bool:
-        """Whether the arm, at q (T, 6), comes on its way too near to itself or the table, or near an object that the
-        chain it plays does not concern."""
+    def _in_the_head(self, candidates: list[Candidate], goals: list[Goal], seen: Frame) -> tuple[np.ndarray, ...]:
+        """Played by pi: what each costs [m], where the objects end (n, 4, 7), how far from the goals [m]."""
+        plans = [[s for e in c.sequence for s in e.chain] for c in candidates]
+        got = self.head.run(
+            seen.q, seen.gripper_closed, seen.object_pose, seen.known,
+            [np.stack([s.z for s in p]) for p in plans], [[s.ticks for s in p] for p in plans],
+        )  # fmt: skip
+        left = np.array([missing(goals, path)[0] for path in got["object_pose"]])
+        met = [
+            self._meets(c.sequence, seen, *way)
+            for c, *way in zip(candidates, got["q"], got["object_pose"], strict=True)
+        ]
+        cost = left + [c.doubt for c in candidates] + met
+        return cost, got["object_pose"][:, -1], left
+
+    def _meets(self, sequence: list[Effect], seen: Frame, q: np.ndarray, object_pose: np.ndarray) -> float:
+        """What the arm meets on its way, at q (T, 6), as farther from the goal [m]: IN_THE_WAY if it comes too near to
+        itself or the table, or near an object that the chain it plays does not concern; and PRESSED a metre that it
+        comes nearer than recorded to what it moves, which it then pushes away instead of grasping it."""
         if too_near(q[: sum(s.ticks for e in sequence for s in e.chain)]):
-            return True
-        at = 0
+            return IN_THE_WAY
+        at, pressed = 0, 0.0
         for e in sequence:
             end = at + sum(s.ticks for s in e.chain)
             for slot in np.flatnonzero(seen.known):
-                if slot not in e.concerns:
-                    distance = self.arm.distance_from(q[at:end], object_pose[at:end, slot, :3])
-                    if distance.min() < CLEAR:
-                        return True
+                if slot in e.concerns and slot not in e.moved:
+                    continue
+                distance = self.arm.distance_from(q[at:end], object_pose[at:end, slot, :3]).min()
+                if slot in e.moved:
+                    pressed += max(0.0, self.near[id(e)][slot] - distance - PRESSED_FROM)
+                elif distance < CLEAR:
+                    return IN_THE_WAY
             at = end
-        return False
+        return PRESSED * pressed

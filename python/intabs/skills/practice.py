@@ -1,5 +1,5 @@
 """Practice: the skills of each demonstration tried in the plant by themselves, so that plans are made of those that do
-their task there, also where another task has just ended. Truth, seeds of its own. No torch.
+their task there. Truth, seeds of its own. No torch.
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ Progress = Callable[[float, str], None]
 CM, SEED = (3.0, 8.0), 500_000  # by turns: far away demonstrations differ in how well they do
 SURE = 3
 MORE = 2  # times as many tries where it is not clear which demonstration does best
-AFTER = 4  # tries after each other task,
-HOPEFUL = 0.5  # of those that do this share of the best from home
-AFAR = " from afar"  # of a demonstration whose start is far away: from home it is taken to be as good as from near
+AFAR = " from afar"  # of a demonstration whose start is far away, where no practice begins: as good as from near
 
 
 def practise(weights: Path, tries: int, jobs: int, progress: Progress) -> None:
@@ -30,48 +28,33 @@ def practise(weights: Path, tries: int, jobs: int, progress: Progress) -> None:
     note(weights, tried(weights, chains, range(tries), jobs, progress), tries, jobs, progress)
 
 
-def tried(
-    weights: Path, chains: list[Chain], tries: range, jobs: int, progress: Progress, after: str = ""
-) -> dict[Chain, float]:
-    """How often each of them did its task, as `worth` has it. after: from where demonstrations of this task ended."""
+def tried(weights: Path, chains: list[Chain], tries: range, jobs: int, progress: Progress) -> dict[Chain, float]:
+    """How often each of them did its task, as `worth` has it."""
     work = [
-        (Setting(task, str(weights), CM[i % len(CM)], "truth", SEED, "", source=source, after=after), i)
+        (Setting(task, str(weights), CM[i % len(CM)], "truth", SEED, "", source=source), i)
         for task, source in sorted(chains)
         for i in tries
-        if after or not source.endswith(AFAR)
+        if not source.endswith(AFAR)
     ]
     won = dict.fromkeys(chains, 0.0)
     for done, ((setting, _), result) in enumerate(zip(work, in_processes(run_trial, work, jobs), strict=True)):
         won[setting.task, setting.source] += worth(result)
-        progress((done + 1) / len(work), f"{setting.task}: {setting.source}" + f" after {after}" * bool(after))
-    if not after:
-        won |= {(task, s): won.get((task, s.removesuffix(AFAR)), 0.0) for task, s in chains}
-    return won
+        progress((done + 1) / len(work), f"{setting.task}: {setting.source}")
+    return won | {(task, s): won.get((task, s.removesuffix(AFAR)), 0.0) for task, s in chains}
 
 
 def note(weights: Path, won: dict[Chain, float], tries: int, jobs: int, progress: Progress) -> None:
-    """Goes on from what `tried` found for the whole library: more tries where needed, and after other tasks."""
+    """Goes on from what `tried` found for the whole library: more tries where they are needed."""
     more = unsure(won, tries)
     again = tried(weights, more, range(tries, MORE * tries), jobs, progress) if more else {}
-    trials = {c: (MORE if c in more else 1) * tries for c in won}
-    total = {c: w + again.get(c, 0.0) for c, w in won.items()}
-    rate = {c: total[c] / trials[c] for c in won}
-    best = {task: max(r for (t, _), r in rate.items() if t == task) for task, _ in won}
-    hopeful = [c for c, r in rate.items() if r >= HOPEFUL * best[c[0]]]
-    later = []
-    for after in best:
-        others = [c for c in hopeful if c[0] != after]
-        did = tried(weights, others, range(AFTER), jobs, progress, after) if others else {}
-        later += [_entry(c, AFTER, w, after) for c, w in did.items()]
     path = weights / "skills.json"
     library = json.loads(path.read_text())
-    library |= {"practice": [_entry(c, trials[c], w) for c, w in total.items()], "practice_after": later}
+    library["practice"] = [
+        {"task": c[0], "source": c[1], "trials": (MORE if c in again else 1) * tries,
+         "success": round(w + again.get(c, 0.0), 3)}
+        for c, w in won.items()
+    ]  # fmt: skip
     write(path, library)
-
-
-def _entry(chain: Chain, trials: int, won: float, after: str = "") -> dict:
-    entry = {"task": chain[0], "source": chain[1], "trials": trials, "success": round(won, 3)}
-    return entry | ({"after": after} if after else {})
 
 
 def write(path: Path, library: dict) -> None:

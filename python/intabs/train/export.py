@@ -70,7 +70,7 @@ def library_of(model, demos: list[Demo], names: list[str], cuts: list[list[int]]
         pose = np.pad(demo.object_pose, ((0, 0), (0, missing), (0, 0)))
         z, of = encode_demo(model, demo, at), (demo.joint_pos, demo.gripper > 0.5, pose, known)
         skills += entries(str(demo.attrs["task"]), name, z, at, *of)
-    return {"skills": skills, "practice": [], "practice_after": []}
+    return {"skills": skills, "practice": []}
 
 
 def variants(data: dict, recorded: dict[str, Demo]) -> list[tuple[str, str, Demo]]:
