@@ -21,18 +21,17 @@ from intabs.errors import UserError
 from intabs.skills.library import SLOTS, TURN_LENGTH, Frame, Library, Skill, rotation
 
 AS_GOOD = 0.15  # success in practice that is as good as another
+AS_WELL = 0.05  # success in practice by which another does not do better
 MOVES = 0.04  # m (a turn counts TURN_LENGTH a radian): an object that comes so far is moved by a chain
 CANDIDATES = 64  # verified, at most,
 KEPT = 2  # beginnings with all that goes on from them
 REMEMBERED = 64  # paths, by each chain
 UNPRACTISED = 0.2  # m: what a chain that never did its task in practice counts as farther from the goal
 APART = 0.1  # of how differently its recordings began counts likewise
-HOPELESS = 0.07  # m: what by the recordings ends so much farther from the goal than the best is not tried in the head
+HOPELESS = 0.1  # m: what by the recordings ends so much farther from the goal than the best is not tried in the head
 BROUGHT_WITHIN = 0.12  # m: an object that ends so near another one was brought to it
 CLEAR = 0.07  # m: an object that the arm's line passes so near is in the arm's way,
 IN_THE_WAY = 0.1  # m: and that counts as so much farther from the goal; leaving a task out counts more
-PRESSED = 8.0  # what comes nearer than recorded to what is grasped, by more than
-PRESSED_FROM = 0.012  # m, counts so many times as farther from the goal: beyond 15 mm a cup is always pushed away
 POURED_WITHIN = 0.16  # m: an object turned so near another one is poured into it
 LOOK = 4  # ticks apart, where it is looked whether the command filter would stop the arm,
 INTO_MARGIN = 0.015  # m: so far inside its margin it often gets past
@@ -148,7 +147,6 @@ class Effect:
         self._told: dict[tuple[int, bytes], np.ndarray] = {}
         frames = [chain[0].frames[0], *(f for s in chain for f in s.frames[1:])]
         self.first, last = frames[0], frames[-1]
-        self.q = np.stack([f.q for f in frames])  # (F, 6)
         self.path = np.stack([f.object_pose for f in frames])  # (F, 4, 7)
         far = np.linalg.norm(self.path[..., :3] - self.path[0, :, :3], axis=-1).max(0)
         turn = np.array([_turns(self.path[:, i]).max() for i in range(SLOTS)])
@@ -204,11 +202,14 @@ def missing(goals: list[Goal], path: np.ndarray) -> tuple[float, int]:
 
 
 def goals_of(library: Library, task: str, seen: Frame) -> list[Goal]:
-    """What a task leaves behind, from the demonstration of it that began most like now: for each object it moves the
-    pose farthest from its start, if it does not stay there, and the last one."""
+    """What a task leaves behind, from the demonstration of it that began most like now, of those that do it best in
+    practice: for each object it moves the pose farthest from its start, if it does not stay there, and the last one."""
     pose, out = seen.object_pose.copy(), []
     for one in task.split("+"):
-        effect = Effect(min(library.of_task(one), key=lambda c: _apart(c, replace(seen, object_pose=pose))))
+        chains = library.of_task(one)
+        best = max(library.rate(c) for c in chains) - AS_WELL
+        chains = [c for c in chains if library.rate(c) >= best]
+        effect = Effect(min(chains, key=lambda c: _apart(c, replace(seen, object_pose=pose))))
         path = effect.on(pose)
         for i in effect.moved:
             far = TURN_LENGTH * _turns(path[:, i])
@@ -258,7 +259,7 @@ class Candidate:
     """Chains one after the other."""
 
     sequence: list[Effect]
-    doubt: float  # what counts as farther from the goal, as practice and where its recordings began have it [m]
+    doubt: float  # [m]
 
 
 class Planner:
@@ -269,10 +270,6 @@ class Planner:
         self.effects = [Effect(chain) for chain in self.library.chains.values()]
         self.head = _core.KinematicRollout(str(weights), CANDIDATES)
         self.arm = _core.ArmModel.lite6()
-        # How near the arm comes to what it moves in the recording [m].
-        self.near = {
-            id(e): {i: self.arm.distance_from(e.q, e.path[:, i, :3]).min() for i in e.moved} for e in self.effects
-        }
 
     def search(self, goals: list[Goal], seen: Frame) -> list[Candidate]:
         """Sequences of chains, the most promising by their recordings first; no longer than there are objects to be
@@ -310,10 +307,18 @@ class Planner:
                 apart = begins[id(a)] + _apart(b.chain, there)
                 found.append((missing(goals, np.concatenate([path, more]))[0], apart, [a, b]))
         # Recordings that do as well as each other: rather the one that began as things are now.
-        ranked = [(left, Candidate(e, APART * min(apart, 10.0) + self.unpractised(e))) for left, apart, e in found]
-        ranked.sort(key=lambda x: x[0] + x[1].doubt)
-        best = ranked[0][0] + ranked[0][1].doubt if ranked else 0.0
-        return [c for left, c in ranked if left + c.doubt < best + HOPELESS]
+        ranked = [
+            (left + APART * min(apart, 10.0) + self.unpractised(e), Candidate(e, self.doubt(e, seen)))
+            for left, apart, e in found
+        ]
+        ranked.sort(key=lambda x: x[0])
+        return [c for cost, c in ranked if cost < ranked[0][0] + HOPELESS]
+
+    def doubt(self, sequence: list[Effect], seen: Frame) -> float:
+        """What counts as farther from the goal, whatever the head says [m]: practice, and a first chain that began with
+        the arm elsewhere."""
+        elsewhere = TURN_LENGTH * float(np.abs(sequence[0].first.q - seen.q).max())
+        return self.unpractised(sequence) + APART * elsewhere
 
     def unpractised(self, sequence: list[Effect]) -> float:
         """What counts as farther from the goal for what its chains did not do in practice [m]. The mean: leaving a task
@@ -360,29 +365,25 @@ class Planner:
             [np.stack([s.z for s in p]) for p in plans], [[s.ticks for s in p] for p in plans],
         )  # fmt: skip
         left = np.array([missing(goals, path)[0] for path in got["object_pose"]])
-        met = [
+        blocked = [
             self._meets(c.sequence, seen, *way)
             for c, *way in zip(candidates, got["q"], got["object_pose"], strict=True)
         ]
-        cost = left + [c.doubt for c in candidates] + met
+        cost = left + [c.doubt for c in candidates] + IN_THE_WAY * np.array(blocked)
         return cost, got["object_pose"][:, -1], left
 
-    def _meets(self, sequence: list[Effect], seen: Frame, q: np.ndarray, object_pose: np.ndarray) -> float:
-        """What the arm meets on its way, at q (T, 6), as farther from the goal [m]: IN_THE_WAY if it comes too near to
-        itself or the table, or near an object that the chain it plays does not concern; and PRESSED a metre that it
-        comes nearer than recorded to what it moves, which it then pushes away instead of grasping it."""
+    def _meets(self, sequence: list[Effect], seen: Frame, q: np.ndarray, object_pose: np.ndarray) -> bool:
+        """Whether the arm, at q (T, 6), comes on its way too near to itself or the table, or near an object that the
+        chain it plays does not concern."""
         if too_near(q[: sum(s.ticks for e in sequence for s in e.chain)]):
-            return IN_THE_WAY
-        at, pressed = 0, 0.0
+            return True
+        at = 0
         for e in sequence:
             end = at + sum(s.ticks for s in e.chain)
             for slot in np.flatnonzero(seen.known):
-                if slot in e.concerns and slot not in e.moved:
-                    continue
-                distance = self.arm.distance_from(q[at:end], object_pose[at:end, slot, :3]).min()
-                if slot in e.moved:
-                    pressed += max(0.0, self.near[id(e)][slot] - distance - PRESSED_FROM)
-                elif distance < CLEAR:
-                    return IN_THE_WAY
+                if slot not in e.concerns:
+                    distance = self.arm.distance_from(q[at:end], object_pose[at:end, slot, :3])
+                    if distance.min() < CLEAR:
+                        return True
             at = end
-        return PRESSED * pressed
+        return False
