@@ -235,6 +235,14 @@ def test_what_was_done_only_on_being_tried_again_is_worth_less():
     ]
 
 
+def test_an_export_with_practice_notes_every_demonstration(made, library, tmp_path):
+    export(made[0].parent / "run", tmp_path / "weights", trials=0, practice=1, jobs=2)
+    practised = Library.load(tmp_path / "weights")
+    assert set(practised.practice) == set(practised.chains) == set(library.chains)
+    noted = json.loads((tmp_path / "weights" / "skills.json").read_text())["practice"]
+    assert all(0 <= c["success"] <= c["trials"] in (1, 2) for c in noted)
+
+
 def test_practice_is_noted_in_the_library_and_plans_are_made_by_it(tmp_path):
     weights = tmp_path / "weights"
     shutil.copytree(paths.MODELS / "weights" / "lite6", weights)
