@@ -67,7 +67,9 @@ def register(app: typer.Typer) -> None:
 
     @skills.command()
     def practise(
-        weights: Annotated[Path, typer.Argument(help="Weights folder; its library is written anew.")],
+        weights: Annotated[
+            str, typer.Argument(help="A name in models/weights, or a folder: its library is rewritten.")
+        ],
         tries: Annotated[int, typer.Option(help="Of each demonstration, more where that tells too little.", min=1)] = 6,
         jobs: Annotated[int, typer.Option(help="Tries at a time.", min=1)] = 1,
         json: Json = None,
@@ -76,12 +78,13 @@ def register(app: typer.Typer) -> None:
         import numpy as np
 
         from intabs.skills import practice
-        from intabs.skills.library import Library
+        from intabs.skills.library import Library, weights_folder
 
-        Library.load(weights)  # before any work
+        folder = weights_folder(weights)
+        Library.load(folder)  # before any work
         with Progress("practise", total=1.0) as progress:
-            practice.practise(weights, tries, jobs, progress.update)
-        library = Library.load(weights)
+            practice.practise(folder, tries, jobs, progress.update)
+        library = Library.load(folder)
         rates = {task: [library.rate(c) for c in library.of_task(task)] for task in library.tasks}
         figures = {task: {"best": max(r), "mean": float(np.mean(r)), "chains": len(r)} for task, r in rates.items()}
         write_json(json, figures)

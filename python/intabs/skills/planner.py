@@ -336,8 +336,10 @@ class Planner:
         searched = time.perf_counter()
         # What the arm meets, and where pi misses, is only seen in the head: first each beginning with what seems to go
         # on from it best, then the best beginnings with all that goes on from them.
-        begin = {id(c.sequence[0]): c for c in reversed(found)}
-        tried = sorted(begin.values(), key=found.index)[: CANDIDATES // 2]
+        begin: dict[int, Candidate] = {}
+        for c in found:
+            begin.setdefault(id(c.sequence[0]), c)
+        tried = list(begin.values())[: CANDIDATES // 2]
         cost, ends, left = self._in_the_head(tried, goals, seen)
         kept = {id(tried[k].sequence[0]) for k in np.argsort(cost)[:KEPT]}
         known = {id(c) for c in tried}
