@@ -67,9 +67,7 @@ def register(app: typer.Typer) -> None:
 
     @skills.command()
     def practise(
-        weights: Annotated[
-            str, typer.Argument(help="A name in models/weights, or a folder: its library changes.")
-        ],
+        weights: Annotated[str, typer.Argument(help="A name in models/weights, or a folder: its library changes.")],
         tries: Annotated[int, typer.Option(help="Of each demonstration, more where that tells too little.", min=1)] = 6,
         jobs: Annotated[int, typer.Option(help="Tries at a time.", min=1)] = 1,
         json: Json = None,
