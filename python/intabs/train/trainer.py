@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
 import json
 import math
@@ -129,6 +130,8 @@ def join_others(device: str) -> tuple[int, int, str]:
         return 0, 1, device
     if not distributed.is_initialized():
         distributed.init_process_group("nccl" if device == "cuda" else "gloo")
+        # gloo's threads may still hold tensors; freeing them while the interpreter ends aborts the process.
+        atexit.register(distributed.destroy_process_group)
     return distributed.get_rank(), world, f"cuda:{os.environ['LOCAL_RANK']}" if device == "cuda" else device
 
 
