@@ -36,9 +36,13 @@ Skill ReadSkill(const nlohmann::json& j) {
   return skill;
 }
 
-bool Done(const Skill& skill, const Skill& before, const Chain& chain) {
+bool Alone(const Chain& chain) {
   const auto there = [](const TrackedObject& object) { return object.id >= 0; };
-  if (std::count_if(chain.objects.begin(), chain.objects.end(), there) != 1) return false;
+  return std::count_if(chain.objects.begin(), chain.objects.end(), there) == 1;
+}
+
+bool Done(const Skill& skill, const Skill& before) {
+  if (!skill.record.alone) return false;
   for (int i = 0; i < kMaxObjects; ++i) {
     if (skill.record.moved[i] > 1.05f * before.record.moved[i] + 0.002f) return false;
   }
@@ -85,7 +89,8 @@ SkillLibrary SkillLibrary::Load(const std::string& dir) {
         library.chains.push_back(ReadChain(j.at("frames").at(0), static_cast<int>(library.skills.size()), number));
       }
       skill.chain = at->second;
-      if (!is_new) skill.record.done = Done(skill, library.skills.back(), library.chains.back());
+      skill.record.alone = Alone(library.chains.back());
+      if (!is_new) skill.record.done = Done(skill, library.skills.back());
       if (at->second + 1 != static_cast<int>(library.chains.size())) throw std::invalid_argument("its demonstration is in two pieces");
       ++library.chains.back().count;
       library.skills.push_back(skill);

@@ -20,8 +20,8 @@ struct SkillRecord {
   std::array<float, kMaxObjects> moved{};
   std::array<bool, kMaxObjects> rested{};
   bool closed = false;  // the gripper was, as this one began
-  // All of `moved` was done before this one began, and nothing else was there on which it could depend how far.
-  bool done = false;
+  bool alone = false;   // nothing else was there on which it could depend how far an object came: a drawer, a lid
+  bool done = false;    // likewise, and all of `moved` was done before this one began
   SkillRecord() { rested.fill(true); }
 };
 

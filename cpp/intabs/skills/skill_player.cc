@@ -76,9 +76,10 @@ void SkillPlayer::Watch(const Observation& observation) noexcept {
 bool SkillPlayer::Missing(const SkillRecord& record, const Observation& observation) const noexcept {
   for (int i = 0; i < kMaxObjects; ++i) {
     if (record.moved[i] <= kEffect || before_[i].id < 0 || !before_[i].valid || !observation.objects[i].valid) continue;
-    if (moved_[i] < kEffectShare * record.moved[i]) return true;
-    // What is there already when it is tried again counts.
-    if (record.done && std::max(moved_[i], came_[i]) < kDoneShare * record.moved[i]) return true;
+    const float nearly_all = kDoneShare * record.moved[i];
+    // What is there already counts: a lid that came up only as it was tried again is not to be opened twice.
+    if (record.alone && came_[i] >= nearly_all) continue;
+    if (moved_[i] < (record.done ? nearly_all : kEffectShare * record.moved[i])) return true;
   }
   return false;
 }

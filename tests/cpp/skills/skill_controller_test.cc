@@ -237,7 +237,7 @@ TEST_CASE("What the record had done before, with nothing else there, is demanded
   for (Skill& s : plan) s.record.rested[0] = false;
   plan[0].record.rested[0] = true;
   plan[1].record.moved[0] = plan[2].record.moved[0] = 0.1f;
-  plan[2].record.done = done;
+  plan[2].record.alone = plan[2].record.done = done;
   REQUIRE(controller.Start(1, plan) == Status::kOk);
   while (controller.player().playing()) {
     r.Advance();
@@ -249,6 +249,25 @@ TEST_CASE("What the record had done before, with nothing else there, is demanded
   // The second time it comes 4.5 cm further of 10: what was there already counts.
   CHECK(controller.player().status().retries == (done && came < 0.075 ? 1 : 0));
   CHECK(controller.player().status().end_reason == EndReason::kFinished);
+}
+
+TEST_CASE("What came only as it was tried again is not to come twice, where it cannot lie anywhere else") {
+  const bool alone = GENERATE(true, false);
+  SkillController controller = MakeController();
+  Readings r;
+  ArmCommand command;
+  std::vector<Skill> plan = PlanWithEffect();
+  for (Skill& s : plan) s.record.alone = alone;
+  REQUIRE(controller.Start(1, plan) == Status::kOk);
+  while (controller.player().playing()) {
+    r.Advance();
+    (void)controller.Tick(r.status, r.poses, command);
+    const PlayerStatus& now = controller.player().status();
+    // As the arm draws back to begin anew; the object rests there from the next skill on.
+    if (now.retries == 1 && now.skill_index == 1) r.poses.objects[0].X_WO.p.z() = 0.07;
+  }
+  CHECK(controller.player().status().retries == (alone ? 1 : kMaxRetries));
+  CHECK(controller.player().status().end_reason == (alone ? EndReason::kFinished : EndReason::kNoEffect));
 }
 
 TEST_CASE("The demonstration that began most like now is the nearest") {
