@@ -19,10 +19,12 @@ from intabs.skills.library import EFFECT, TURN_LENGTH, Frame, Library, drawing  
 from intabs.skills.planner import (  # noqa: E402
     APART,
     CANDIDATES,
+    FORGIVEN,
     KEPT,
     Effect,
     Goal,
     Planner,
+    as_good,
     goals_of,
     load_goals,
     missing,
@@ -269,6 +271,31 @@ def test_practice_is_noted_in_the_library_and_plans_are_made_by_it(tmp_path):
     assert planner.doubt([drawer, pick], elsewhere) == pytest.approx(
         planner.doubt([drawer, pick], home) + APART * TURN_LENGTH * 2
     )
+
+
+def test_a_demonstration_whose_hand_misses_in_the_head_is_not_played(monkeypatch):
+    planner = Planner(paths.MODELS / "weights" / "lite6")
+    session = _core.Session(str(paths.MODELS), "box_open", "")
+    session.reset(6_000_001, 10.0)
+    seen = seen_from(session.observe())
+    nearest = whole(planner.library, "box_open", seen)
+    chosen = planner.for_task("box_open", seen)
+    chains = as_good(planner.library, "box_open")
+    played = planner._play(chains, seen)
+    beside = {
+        c[0].source: planner._beside(c, q, pose)
+        for c, q, pose in zip(chains, played["q"], played["object_pose"], strict=True)
+    }
+    assert beside[chosen.skills[0].source] < beside[nearest.skills[0].source]
+    # So far beside as the object lies elsewhere, but for what is forgiven.
+    own = chains[0][0].frames[0]
+    there = planner._play([chains[0]], own)
+    q, pose = there["q"][0], there["object_pose"][0]
+    hits = planner._beside(chains[0], q, pose)
+    pose[..., 0] += 0.2
+    assert hits < 0.02 and planner._beside(chains[0], q, pose) == pytest.approx(0.2 - FORGIVEN, abs=0.03)
+    monkeypatch.setattr(planner, "_beside", lambda *_: 0.0)
+    assert planner.for_task("box_open", seen).about == nearest.about
 
 
 def test_a_run_needs_a_scene(made, library):

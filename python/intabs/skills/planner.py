@@ -28,6 +28,8 @@ KEPT = 2  # beginnings with all that goes on from them
 REMEMBERED = 64  # paths, by each chain
 UNPRACTISED = 0.2  # m: what a chain that never did its task in practice counts as farther from the goal
 APART = 0.1  # of how differently its recordings began counts likewise
+BEGINS = 0.015  # m (a turn counts TURN_LENGTH a radian): an object that came so far in a skill began to move in it
+FORGIVEN = 0.01  # m, of how far beside where the recording's came the hand comes to it
 HOPELESS = 0.1  # m: what by the recordings ends so much farther from the goal than the best is not tried in the head
 BROUGHT_WITHIN = 0.12  # m: an object that ends so near another one was brought to it
 CLEAR = 0.07  # m: an object that the arm's line passes so near is in the arm's way,
@@ -107,13 +109,18 @@ def whole(library: Library, task: str, seen: Frame | None, source: str = "") -> 
     skills: list[Skill] = []
     sources = []
     for one in task.split("+"):
-        chains = library.of_task(one)
-        best = max(library.rate(c) for c in chains)
-        chains = [c for c in chains if (c[0].source == source if source else library.rate(c) >= best - AS_GOOD)]
+        chains = [c for c in library.of_task(one) if c[0].source == source] if source else as_good(library, one)
         chain = chains[0] if seen is None else min(chains, key=lambda c: _apart(c, seen))
         skills += chain
         sources.append(f"{one}: {chain[0].source}")
     return Plan(skills, ", ".join(sources))
+
+
+def as_good(library: Library, task: str) -> list[list[Skill]]:
+    """Demonstrations of a task that do it in practice about as well as the best one."""
+    chains = library.of_task(task)
+    best = max(library.rate(c) for c in chains)
+    return [c for c in chains if library.rate(c) >= best - AS_GOOD]
 
 
 def _apart(chain: list[Skill], seen: Frame) -> float:
@@ -326,9 +333,41 @@ class Planner:
         return UNPRACTISED * float(np.mean([1 - self.library.rate(e.chain) for e in sequence]))
 
     def for_task(self, task: str, seen: Frame) -> Plan:
-        """The demonstration of it that began most like now; for tasks joined by +, which nobody demonstrated as a
-        whole, what is found for the poses they leave behind, in the order that pi gets done best."""
-        return self.find(goals_of(self.library, task, seen), seen) if "+" in task else whole(self.library, task, seen)
+        """The demonstration of it that began most like now and whose hand, in pi's head, comes to what it moves; for
+        tasks joined by +, which nobody demonstrated as a whole, what is found for the poses they leave behind, in the
+        order that pi gets done best."""
+        return self.find(goals_of(self.library, task, seen), seen) if "+" in task else self._nearest(task, seen)
+
+    def _nearest(self, task: str, seen: Frame) -> Plan:
+        chains = sorted(as_good(self.library, task), key=lambda c: _apart(c, seen))[:CANDIDATES]
+        got = self._play(chains, seen)
+        beside = [self._beside(c, *way) for c, *way in zip(chains, got["q"], got["object_pose"], strict=True)]
+        cost = [APART * _apart(c, seen) + b for c, b in zip(chains, beside, strict=True)]
+        best = chains[int(np.argmin(cost))]
+        return Plan(best, f"{task}: {best[0].source}")
+
+    def _beside(self, chain: list[Skill], q: np.ndarray, object_pose: np.ndarray) -> float:
+        """How far beside where the recording's came the hand comes to what it moves, as far as that matters [m]. q
+        (T, 6), object_pose (T, 4, 7), told from the object, at the end of the last skill before it moves."""
+        slot = int(np.argmax(np.max([s.moved for s in chain], 0)))
+        first = next((k for k, s in enumerate(chain) if s.moved[slot] > BEGINS), 0)
+        if first == 0:
+            return 0.0
+        at = sum(s.ticks for s in chain[:first]) - 1
+        recorded = chain[first].frames[0]
+        off = self._from(object_pose[at, slot], q[at]) - self._from(recorded.object_pose[slot], recorded.q)
+        return max(0.0, float(np.linalg.norm(off)) - FORGIVEN)
+
+    def _from(self, pose: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """Where the tip of the arm at q is, told from an object (3,) [m]."""
+        return rotation(pose).inv().apply(np.asarray(self.arm.tip(q))[:3] - pose[:3])
+
+    def _play(self, chains: list[list[Skill]], seen: Frame) -> dict:
+        """In pi's head, each from as things are now."""
+        return self.head.run(
+            seen.q, seen.gripper_closed, seen.object_pose, seen.known,
+            [np.stack([s.z for s in c]) for c in chains], [[s.ticks for s in c] for c in chains],
+        )  # fmt: skip
 
     def find(self, goals: list[Goal], seen: Frame) -> Plan:
         began = time.perf_counter()
@@ -361,11 +400,7 @@ class Planner:
 
     def _in_the_head(self, candidates: list[Candidate], goals: list[Goal], seen: Frame) -> tuple[np.ndarray, ...]:
         """Played by pi: what each costs [m], where the objects end (n, 4, 7), how far from the goals [m]."""
-        plans = [[s for e in c.sequence for s in e.chain] for c in candidates]
-        got = self.head.run(
-            seen.q, seen.gripper_closed, seen.object_pose, seen.known,
-            [np.stack([s.z for s in p]) for p in plans], [[s.ticks for s in p] for p in plans],
-        )  # fmt: skip
+        got = self._play([[s for e in c.sequence for s in e.chain] for c in candidates], seen)
         left = np.array([missing(goals, path)[0] for path in got["object_pose"]])
         blocked = [
             self._meets(c.sequence, seen, *way)
