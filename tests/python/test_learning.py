@@ -385,7 +385,7 @@ def test_processes_that_joined_end_by_themselves(tmp_path):
         "for _ in range(20):\n"
         "    torch.distributed.all_reduce(torch.ones(100_000))\n"
     )
-    torchrun([str(tmp_path / "join.py")], 4)
+    assert torchrun([str(tmp_path / "join.py")], 4).returncode == 0
 
 
 def two_train_as_one(data, tmp_path, kind):

@@ -19,7 +19,7 @@ namespace intabs {
 
 inline constexpr float kEffect = 0.05f;        // [m] an object that came so far in the record is demanded to come ...
 inline constexpr float kEffectShare = 0.4f;    // ... this share of it
-inline constexpr float kDoneShare = 0.75f;     // ... and this much where the record had done it before (SkillRecord::done)
+inline constexpr float kDoneShare = 0.75f;     // ... or this much: SkillRecord::done, and of `alone` what is there already
 inline constexpr int kMaxRetries = 3;          // in a plan; the first by the same skills
 inline constexpr int kMaxSkills = 128;       // in a plan
 

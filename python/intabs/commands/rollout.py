@@ -48,7 +48,9 @@ def register(app: typer.Typer) -> None:
         plan: Annotated[
             Way | None,
             typer.Option(
-                help="whole (single tasks): the demonstration that began most like now; goal (compositions): found."
+                help="whole: the demonstration that began most like now; goal: found for the poses the task leaves "
+                "behind. Without it: single tasks like whole, where the hand comes to the object in pi's head; "
+                "tasks joined by + like goal."
             ),
         ] = None,
         nudge: Annotated[
