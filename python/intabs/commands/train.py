@@ -41,7 +41,7 @@ def register(app: typer.Typer) -> None:
             import torch
         except ImportError:
             raise UserError("torch is not installed: run tools/setup (without --runtime-only)") from None
-        from intabs.train.trainer import Trainer, load_config
+        from intabs.train.trainer import Trainer, end_together, load_config
 
         if device is Device.cuda and not torch.cuda.is_available():
             raise UserError("--device cuda: torch sees no GPU here; leave it out")
@@ -52,10 +52,11 @@ def register(app: typer.Typer) -> None:
             raise UserError(f"{trainer.path} is there already: add --resume, or give another --out")
         if trainer.rank > 0:
             trainer.train()
-            return
+            end_together()
         with Progress("train", total=trainer.config["train"]["steps"]) as progress:
             figures = trainer.train(progress.update)
         write_json(json, figures)
         valid = ", ".join(f"{k} {v:.4f}" for k, v in figures["valid"].items()) or "nothing held out"
         print(f"{out}: {figures['steps']} steps in {figures['seconds']:.0f} s, loss {figures['loss']:.4f}")
         print(f"  held out: {valid}")
+        end_together()

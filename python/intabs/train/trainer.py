@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -133,6 +134,16 @@ def join_others(device: str) -> tuple[int, int, str]:
         # gloo's threads may still hold tensors; freeing them while the interpreter ends aborts the process.
         atexit.register(distributed.destroy_process_group)
     return distributed.get_rank(), world, f"cuda:{os.environ['LOCAL_RANK']}" if device == "cuda" else device
+
+
+def end_together() -> None:
+    """Ends the processes that joined, when each has done its work; returns if there is only one. Not by way of the
+    interpreter's end: there one of two was aborted after hours of training although it had left the group."""
+    if distributed.is_initialized():
+        distributed.barrier()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(0)
 
 
 class _Curves:
