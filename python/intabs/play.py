@@ -18,22 +18,22 @@ from intabs import _core, bus, messages, paths
 from intabs.errors import UserError, as_user_error
 from intabs.processes import Processes, free_ports, shared_memory_name, terminated_like_interrupted
 from intabs.skills.library import Frame, Library, weights_folder
-from intabs.skills.planner import Plan, Planner, whole
+from intabs.skills.planner import Plan, Planner, missing, whole
 
 WEIGHTS = "lite6"
 CAMERAS = ("left", "right")  # of the plant that perception sees
 SETTLE_S = 2.0  # after the plan's end: so long may success take to show
 TICK_S = 0.04  # policy
-TRIES = 2.0  # so many times the plan's longest duration may a run last: skills are tried again
+TRIES = 4.0  # so many times the plan's longest duration may a run last: kMaxRetries of skills/skill_player.h, and once
 
 # skills/skill_player.h EndReason
-RUNNING, FINISHED = 1, 2
+RUNNING, FINISHED, NO_EFFECT = 1, 2, 7
 END_REASONS = {
     3: "the plan was aborted",
     4: "perception went silent",
     5: "a reading or the policy's output was not finite",
     6: "the driver refused to go on (fault, stop, or another session)",
-    7: "an object did not move as in the demonstration, however often it was tried",
+    NO_EFFECT: "an object did not move as in the demonstration, however often it was tried",
 }
 FAULTED = 6
 # core/types.h Fault
@@ -58,6 +58,7 @@ class Options:
     out: Path = Path("out/demo")
     viewer: bool = False
     plan: Callable[[Planner, Frame], Plan] | None = None  # None: Planner.for_task
+    by_goals: bool = False  # success is that the plan's goals are reached, not the world's task
     weights: str = WEIGHTS
 
 
@@ -130,7 +131,7 @@ class _Run:
     def _end(self, limit_us: int) -> tuple[int, bool] | None:
         if self.finished_us is None:
             return limit_us, False
-        if self.end_reason != FINISHED:
+        if self.end_reason not in (FINISHED, NO_EFFECT):  # what the player missed may be there all the same
             return self.finished_us, False
         for utime, success in sorted((t.utime, t.success) for t in self.truth.values() if t.utime >= self.finished_us):
             if success:
@@ -146,6 +147,11 @@ class _Run:
             if t.utime <= end_us:
                 bits |= t.subgoals
         return bits
+
+    def paths(self, end_us: int) -> np.ndarray:
+        """Of the objects (F, 4, 7), as they were."""
+        heard = [self.truth[k] for k in sorted(self.truth) if self.start_us <= self.truth[k].utime <= end_us]
+        return np.array([np.concatenate([m.p_WO, m.q_WO], 1) for m in heard])
 
     def object_errors_mm(self, end_us: int) -> list[float]:
         """Distance of each valid pose from the truth of the same frame."""
@@ -239,6 +245,8 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
         planner = Planner(weights)
         plan = options.plan(planner, seen) if options.plan else planner.for_task(options.task, seen)
         report(0.0, plan.about)
+        if plan.predicted is not None:  # told before anything moves
+            print(plan.expected(seen), flush=True)
         parts = messages.plan_parts(run.plan_id, plan.as_messages())
         longest_s = sum(s.max_ticks for s in plan.skills) * TICK_S
         # By the wall clock the arm holds while perception is behind.
@@ -262,13 +270,21 @@ def play(options: Options, report: Callable[[float, str], None]) -> tuple[dict, 
             raise UserError(f"{name} did not end cleanly (exit code {code}): {processes.last_line(name)}")
 
     end_us, success = end
+    left = missing(plan.goals, run.paths(end_us)) if plan.goals else None
+    if options.by_goals:
+        success = run.end_reason in (FINISHED, NO_EFFECT) and int(left[1]) == len(plan.goals)
     summary = _summary(options, run, end_us, success, {n: _figures(f) for n, f in figures.items()}, subgoals)
     if fault:
         summary["fault"] = fault
     summary["plan"] = {"about": plan.about, "skills": [s.index for s in plan.skills], "retries": run.skill.retries}
     if plan.predicted is not None:
         summary["plan"] |= {"predicted": plan.predicted.tolist(), "search_s": plan.search_s, "verify_s": plan.verify_s}
-    return summary, "" if success else _why(run, summary, end_us)
+    if left is not None:
+        summary["plan"]["ended_from_goal_m"] = left[0]
+    why = "" if success else _why(run, summary, end_us)
+    if options.by_goals and run.end_reason == FINISHED and not success:
+        why = f"the objects ended {1000 * left[0]:.0f} mm from the goal"
+    return summary, why
 
 
 def _first_status(url: str, processes: Processes) -> messages.lite6_status_t:

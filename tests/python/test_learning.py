@@ -134,6 +134,17 @@ def test_kl_is_that_of_torch():
         torch.distributions.Normal(mean, log_std.exp()), torch.distributions.Normal(0.0, 1.0)
     )
     torch.testing.assert_close(kl_to_standard_normal(mean, log_std), want.sum(-1).mean())
+    free = 0.5
+    assert (want < free).any() and (want > free).any()
+    torch.testing.assert_close(kl_to_standard_normal(mean, log_std, free), want.clamp(min=free).sum(-1).mean())
+
+
+def test_what_z_says_within_its_free_bits_costs_nothing():
+    """The price pulls only on numbers of z that say more."""
+    mean = torch.zeros(1, 2) + torch.tensor([0.1, 3.0])
+    mean.requires_grad_()
+    kl_to_standard_normal(mean, torch.zeros(1, 2), 0.5).backward()
+    assert mean.grad[0, 0] == 0 and mean.grad[0, 1] == 3
 
 
 def test_kl_between_gaussians_is_that_of_torch():
@@ -602,6 +613,7 @@ def test_evaluate_compares_kinds_of_runs_and_names_what_is_missing(data, tmp_pat
         runs.append(run)
     figures = evaluate(runs, data, None, "whole")
     assert list(figures["methods"])[:3] == ["intabs", "tvi", "tvi-agent"] and figures["seeds"] == 2
+    assert figures["usage"]["of"] == [8, 8] and 0 < figures["usage"]["skills"] and max(figures["usage"]["active"]) <= 8
     assert figures["methods"]["intabs"]["sd"] > 0 == figures["methods"]["tvi"]["sd"]
     ratio, low, high = figures["ratios"]["still"]["all"]
     assert low <= ratio <= high

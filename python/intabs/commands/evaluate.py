@@ -61,6 +61,12 @@ def register(app: typer.Typer) -> None:
         for name, f in figures["ratios"].items():
             text = "".join(f"  {k} {f[k][0]:.2f} ({f[k][1]:.2f}-{f[k][2]:.2f})" for k in FIGURES)
             print(f"{next(iter(figures['methods']))} / {name}:{text}")
+        if u := figures.get("usage"):
+            active = " and ".join(f"{a} of {n}" for a, n in zip(u["active"], u["of"], strict=True))
+            print(
+                f"usage: {u['skills']} skills of {u['demonstrations']} demonstrations, {u['ticks']:.0f} ticks long "
+                f"(median); {active} numbers of z in use"
+            )
         if "knn" in figures:
             k = figures["knn"]
             print(

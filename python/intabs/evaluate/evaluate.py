@@ -17,6 +17,7 @@ from intabs.evaluate.hdmp import FaithfulHdmp, Hdmp
 from intabs.evaluate.knn import Codes, score_compositions, score_neighbours
 from intabs.evaluate.learned import Learned
 from intabs.evaluate.metrics import Motion, Scaling, errors, fixed_cuts, sample, seen_from_tip
+from intabs.evaluate.usage import score_usage
 
 KINDS = {"split": "intabs", "joint": "tvi", "agent": "tvi-agent"}
 METHODS = ("intabs", "tvi", "tvi-agent", "pca", "hdmp", "hdmp-faithful", "still", "mean")
@@ -66,8 +67,8 @@ def evaluate(
 ) -> dict:
     """Several sources of a kind are several seeds of one method; methods None: all that there are.
 
-    {methods: {name: {all, balanced, joints, position, orientation, sd, n}}, knn, boundaries, ratios, seeds}: means
-    over held-out demonstrations, or over all their segments; sd over seeds, of `all`; for the Lite 6 also FROM_TIP.
+    {methods: {name: {all, balanced, joints, position, orientation, sd, n}}, usage, knn, boundaries, ratios, seeds}:
+    means over held-out demonstrations, or over all their segments; sd over seeds, of `all`; for the Lite 6 also FROM_TIP.
     ratios: of the first method's figures to the others', with 95 % intervals (bootstrap over held-out demonstrations,
     paired).
     """
@@ -138,6 +139,8 @@ def evaluate(
         "ratios": ratios(rows, [i for i, _, _ in pieces]),
     }
     main = learned.get("intabs") or next(iter(learned.values()))
+    if main[0].cuts_itself:
+        out["usage"] = score_usage(main[0], train_demos, held_out_demos)
     if all("labels" in d.extra for d in train_demos + held_out_demos):
         codes = Codes(main, Pca(train, scaling, segment))
         out["knn"] = score_neighbours(codes, train_demos, held_out_demos)

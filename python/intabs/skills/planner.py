@@ -83,6 +83,7 @@ class Plan:
     missing: float = float("nan")  # m, of the goals in that prediction
     search_s: float = 0.0
     verify_s: float = 0.0
+    goals: list[Goal] | None = None  # that it was found for
 
     def arrays(self) -> tuple[np.ndarray, np.ndarray, list[int]]:
         """As _core.Rollout.run takes it: z (n, 16), shortest and longest duration (n, 2), index in the library."""
@@ -91,6 +92,15 @@ class Plan:
 
     def as_messages(self) -> list[dict]:
         return [s.as_plan() for s in self.skills]
+
+    def expected(self, seen: Frame) -> str:
+        """Of a plan that was found: what it is, where the objects should end."""
+        lines = [f"{self.about}: {len(self.skills)} skills, {0.04 * sum(s.ticks for s in self.skills):.0f} s"]
+        for i in np.flatnonzero(seen.known):
+            p = ", ".join(f"{100 * v:.1f}" for v in self.predicted[i, :3])
+            lines.append(f"  object {i} should end at ({p}) cm")
+        times = f"searched {self.search_s:.2f} s, verified {self.verify_s:.2f} s"
+        return "\n".join([*lines, f"  {1000 * self.missing:.0f} mm from the goal; {times}"])
 
 
 def seen_from(observation: dict) -> Frame:
@@ -279,8 +289,7 @@ class Planner:
         self.arm = _core.ArmModel.lite6()
 
     def search(self, goals: list[Goal], seen: Frame) -> list[Candidate]:
-        """Sequences of chains, the most promising by their recordings first; no longer than there are objects to be
-        moved."""
+        """Sequences of chains, the most promising by their recordings first: one, or two that move different objects."""
         unknown = [g.slot for g in goals if not seen.known[g.slot]]
         if unknown:
             raise UserError(f"the goal names object {unknown[0]}, which is not seen")
@@ -396,6 +405,7 @@ class Planner:
             float(left[best]),
             searched - began,
             time.perf_counter() - searched,
+            goals,
         )
 
     def _in_the_head(self, candidates: list[Candidate], goals: list[Goal], seen: Frame) -> tuple[np.ndarray, ...]:

@@ -31,13 +31,15 @@ def action_error(predicted: Tensor, target: Tensor, mask: Tensor) -> Tensor:
     return mean_over(((predicted - target) ** 2).mean(-1), mask)
 
 
-def kl_each(mean: Tensor, log_std: Tensor) -> Tensor:
-    """KL(N(mean, std^2) || N(0, I)) of each skill [nat], summed over z (Kingma & Welling 2014, appendix B)."""
-    return (0.5 * (mean**2 + torch.exp(2 * log_std) - 1) - log_std).sum(-1)
+def kl_each(mean: Tensor, log_std: Tensor, free: float = 0.0) -> Tensor:
+    """KL(N(mean, std^2) || N(0, I)) of each skill [nat], summed over z (Kingma & Welling 2014, appendix B). free: nats
+    that each dimension may say at the same price (free bits: Kingma et al. 2016, C.8; there of the batch's mean, here
+    of each skill, so that several processes need not agree on it)."""
+    return (0.5 * (mean**2 + torch.exp(2 * log_std) - 1) - log_std).clamp(min=free).sum(-1)
 
 
-def kl_to_standard_normal(mean: Tensor, log_std: Tensor) -> Tensor:
-    kl = kl_each(mean, log_std)
+def kl_to_standard_normal(mean: Tensor, log_std: Tensor, free: float = 0.0) -> Tensor:
+    kl = kl_each(mean, log_std, free)
     return mean_over(kl, torch.ones_like(kl))
 
 

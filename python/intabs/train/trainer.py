@@ -283,7 +283,7 @@ class Trainer:
             of_windows, of_skills = batch.chance(rng)
             noise = of_skills.standard_normal(tuple(mean.shape))
             z = mean + torch.exp(log_std) * torch.from_numpy(noise).to(mean.device)
-        terms = {"kl": kl_to_standard_normal(mean, log_std)}
+        terms = {"kl": kl_to_standard_normal(mean, log_std, o["free_bits"])}
         if space.arm is not None:
             if rng is not None:  # what a servo with errors and cameras with errors would say
                 state, _ = space.features(disturbed(now, self.config["noise"], of_windows))
