@@ -613,7 +613,7 @@ def test_evaluate_compares_kinds_of_runs_and_names_what_is_missing(data, tmp_pat
         runs.append(run)
     figures = evaluate(runs, data, None, "whole")
     assert list(figures["methods"])[:3] == ["intabs", "tvi", "tvi-agent"] and figures["seeds"] == 2
-    assert figures["usage"]["of"] == [8, 8] and 0 < figures["usage"]["skills"] and max(figures["usage"]["active"]) <= 8
+    assert figures["usage"]["of"] == [8, 8] and figures["usage"]["skills"] > 0 and max(figures["usage"]["active"]) <= 8
     assert figures["methods"]["intabs"]["sd"] > 0 == figures["methods"]["tvi"]["sd"]
     ratio, low, high = figures["ratios"]["still"]["all"]
     assert low <= ratio <= high

@@ -11,7 +11,6 @@ from intabs.commands.demo import Out, Perception, PerceptionOption, Seed, play_a
 from intabs.errors import UserError
 from intabs.output import write_json
 
-
 FAR = 0.2  # m: what no demonstration does is not tried
 
 
@@ -52,8 +51,8 @@ def register(app: typer.Typer) -> None:
             found = of_planner.find(goals, seen)
             if found.missing > FAR:
                 raise UserError(
-                    f"--goal {goal}: the nearest that demonstrations lead to is {found.missing:.2f} m from it; want the "
-                    "objects where a demonstration of this world brings them"
+                    f"--goal {goal}: the nearest that demonstrations lead to is {found.missing:.2f} m from it; want "
+                    "the objects where a demonstration of this world brings them"
                 )
             return found
 

@@ -68,7 +68,8 @@ def evaluate(
     """Several sources of a kind are several seeds of one method; methods None: all that there are.
 
     {methods: {name: {all, balanced, joints, position, orientation, sd, n}}, usage, knn, boundaries, ratios, seeds}:
-    means over held-out demonstrations, or over all their segments; sd over seeds, of `all`; for the Lite 6 also FROM_TIP.
+    means over held-out demonstrations, or over all their segments; sd over seeds, of `all`; for the Lite 6 also
+    FROM_TIP.
     ratios: of the first method's figures to the others', with 95 % intervals (bootstrap over held-out demonstrations,
     paired).
     """

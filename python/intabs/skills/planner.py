@@ -289,7 +289,7 @@ class Planner:
         self.arm = _core.ArmModel.lite6()
 
     def search(self, goals: list[Goal], seen: Frame) -> list[Candidate]:
-        """Sequences of chains, the most promising by their recordings first: one, or two that move different objects."""
+        """Sequences of chains, the most promising by their recordings first: one, or two that move different things."""
         unknown = [g.slot for g in goals if not seen.known[g.slot]]
         if unknown:
             raise UserError(f"the goal names object {unknown[0]}, which is not seen")
