@@ -149,8 +149,8 @@ class _Run:
         return bits
 
     def paths(self, end_us: int) -> np.ndarray:
-        """Of the objects (F, 4, 7), as they were."""
-        heard = [self.truth[k] for k in sorted(self.truth) if self.start_us <= self.truth[k].utime <= end_us]
+        """Of the objects (F, 4, 7), as they were, from before the plan began on: never empty."""
+        heard = [self.truth[k] for k in sorted(self.truth) if self.truth[k].utime <= max(end_us, self.start_us)]
         return np.array([np.concatenate([m.p_WO, m.q_WO], 1) for m in heard])
 
     def object_errors_mm(self, end_us: int) -> list[float]:

@@ -7,6 +7,8 @@ import sys
 import pytest
 
 from bench import need_programs
+from intabs import messages
+from intabs.play import NO_EFFECT, _Run
 
 need_programs()
 
@@ -39,7 +41,7 @@ def test_a_goal_file_is_planned_for_told_of_and_reached(tmp_path):
 
     goal.write_text(json.dumps({"goals": [{"object": 0, "p_WO": [-0.9, -0.9, 1.5]}]}))
     refused = intabs("plan", *world)
-    assert refused.returncode == 1 and refused.stderr.count("\n") == 1 and "1.97 m from it" in refused.stderr
+    assert refused.returncode == 1 and refused.stderr.count("\n") == 1 and "m from it" in refused.stderr
 
 
 def test_success_is_the_goals_of_a_file_and_not_the_worlds_task(tmp_path):
@@ -51,6 +53,20 @@ def test_success_is_the_goals_of_a_file_and_not_the_worlds_task(tmp_path):
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert not summary["success"] and summary["plan"]["ended_from_goal_m"] > 0.03
     assert all(s["success"] for s in summary["subtasks"])
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_what_the_player_missed_counts_if_the_world_has_it(there):
+    run = _Run(1, lockstep=True, by_time=False)
+    for end_reason, utime in ((1, 0), (NO_EFFECT, 1_000_000)):
+        m = messages.skill_status_t()
+        m.plan_id, m.end_reason, m.utime = 1, end_reason, utime
+        run.on_skill(m)
+    for frame in range(50):
+        m = messages.plant_truth_t()
+        m.frame_seq, m.utime, m.success = frame, frame * 100_000, there
+        run.on_truth(m)
+    assert run.end(60.0)[1] == there
 
 
 @pytest.mark.parametrize("how, good", [(["--plan", "whole"], 2), (["--ablate", "objects"], 0), (["--ablate", "z"], 0)])

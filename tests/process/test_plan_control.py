@@ -47,6 +47,7 @@ def test_a_plan_pauses_goes_on_gives_way_to_another_and_ends_when_told(tmp_path)
             return last(bench).plan_id == 2 and last(bench).end_reason == RUNNING
 
         bench.until(taken, "the second plan")
+        bench.until(lambda: last(bench).skill_index > 0, "the second plan on its way")
         # The command filter's limits, 2.14 rad/s and 20 rad/s^2, at a tick of 4 ms: no jump, no jolt. LCM loses some.
         heard = bench.heard["LITE6_STATUS"]
         q, t = np.array([s.q_commanded for s in heard]), np.array([s.utime for s in heard])
