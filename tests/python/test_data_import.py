@@ -249,11 +249,8 @@ def kitchen_observations(n: int, rng) -> np.ndarray:
     return o
 
 
-@pytest.mark.parametrize("end", ["terminals", "timeouts"])
-def test_d4rl_files_are_cut_into_their_episodes(tmp_path, end):
+def d4rl(path: Path, lengths: list[int], end: str = "terminals") -> Path:
     rng = np.random.default_rng(0)
-    lengths = [40, 25, 60]
-    path = tmp_path / "kitchen.hdf5"
     flags = np.zeros(sum(lengths), bool)
     flags[np.cumsum(lengths)[:-1] - 1] = True
     with h5py.File(path, "w") as f:
@@ -261,13 +258,35 @@ def test_d4rl_files_are_cut_into_their_episodes(tmp_path, end):
         f["actions"] = rng.uniform(-1, 1, (sum(lengths), 9)).astype("f4")
         f["rewards"] = np.zeros(sum(lengths), "f4")
         f[end] = flags
-    figures = bring("kitchen", path, tmp_path / "a.hdf5")
+    return path
+
+
+@pytest.mark.parametrize("end", ["terminals", "timeouts"])
+def test_d4rl_files_are_cut_into_their_episodes(tmp_path, end):
+    lengths = [40, 25, 60]
+    figures = bring("kitchen", d4rl(tmp_path / "kitchen.hdf5", lengths, end), tmp_path / "a.hdf5")
     assert figures["demos"] == 3 and figures["frames"] == 125 and figures["rate_hz"] == 12.5
     with DemoFile(tmp_path / "a.hdf5") as f:
         assert f.lengths.tolist() == lengths
         arrays = f.arrays(1)
     assert arrays.agent.shape == (25, 9) and arrays.environment.shape == (25, 14)
     np.testing.assert_allclose(arrays.objects[0, 0], [-0.27, 0.35, 1.62, 1, 0, 0, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("lengths", [[40, 90], [40] * 20])
+def test_the_table_takes_files_as_they_come(tmp_path, lengths):
+    from intabs.evaluate.table import about, imported
+
+    source, out = d4rl(tmp_path / "kitchen.hdf5", lengths), tmp_path / "runs" / "kitchen.hdf5"
+    imported("kitchen", source, None, out, lambda done, text: None)
+    few = len(lengths) < 20
+    assert about(out) == {
+        "about": "4 pieces of 2 demonstrations, 1 held out" if few else "20 demonstrations, 2 held out",
+        "demonstrations": len(lengths),
+    }
+    assert list(out.parent.iterdir()) == [out]
+    source.unlink()  # what is there is taken
+    assert imported("kitchen", source, None, out, lambda done, text: None) == out
 
 
 PENDULUM = """<mujoco><worldbody>

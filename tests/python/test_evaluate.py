@@ -269,6 +269,57 @@ def test_the_confusion_picture_names_what_was_seen(tmp_path):
     assert shown["rows"] == ["reach (4)", "2 (2)"] and (tmp_path / "c.png").stat().st_size > 5000
 
 
+class Labelled:
+    """A demonstration of which only the labels matter."""
+
+    def __init__(self, labels, task="a"):
+        self.extra, self.attrs = {"labels": np.array(labels)}, {"task": task}
+
+    def __len__(self):
+        return len(self.extra["labels"])
+
+
+def test_found_boundaries_stand_beside_the_best_fixed_cut_and_the_mean_times_of_the_task():
+    from types import SimpleNamespace
+
+    from intabs.evaluate.boundaries import mean_times, score_boundaries
+
+    train = [Labelled([0] * 20 + [1] * 20), Labelled([0] * 40 + [1] * 20 + [2] * 20), Labelled([0] * 30 + [1], "b")]
+    train += [Labelled([0] * 10 + [1] * 30), Labelled([0] * 100, "none")]
+    # One boundary is the task's median; those of its three demonstrations lie at 1/2, (1/2 + 3/4) / 2 and 1/4.
+    assert mean_times(train, Labelled([0] * 80)) == pytest.approx([80 * (1 / 2 + 5 / 8 + 1 / 4) / 3])
+    assert len(mean_times(train, Labelled([0] * 80, "none"))) == 0
+
+    held_out = [Labelled([0] * 21 + [1] * 19)]
+    found = SimpleNamespace(cuts=lambda train, demos: [np.array([0, 22, 33, 40])])
+    got = score_boundaries(found, train[:1] * 3, held_out)
+    assert (got["precision"], got["recall"], got["f1"]) == (1 / 2, 1, pytest.approx(2 / 3))
+    assert got["fixed_cut_f1"] == 1 and got["mean_time_f1"] == 1  # every training demonstration changes at 20 of 40
+    got = score_boundaries(found, [Labelled([0] * 10 + [1] * 30)] * 3, held_out)
+    assert got["mean_time_f1"] == 0 and got["fixed_cut_f1"] < 1
+
+
+def test_neighbours_are_of_the_training_split_and_scored_for_every_code():
+    from intabs.evaluate.knn import score_neighbours
+
+    class Known:
+        """z says the label, PCA nothing, the untrained encoder the opposite of two."""
+
+        def of(self, demos, pieces):
+            labels = np.array([x for p in pieces for _, _, x in p])
+            some = np.random.default_rng(len(labels)).normal(size=(len(labels), 1)) * 0.1
+            return {
+                "z": [np.stack([labels, labels], 1) + some],
+                "untrained": [some + (labels if len(demos) > 1 else 1 - labels)[:, None]],
+                "pca": [some * 0 + np.arange(len(labels))[:, None]],
+            }
+
+    train, held_out = [Labelled([0] * 5 + [1] * 6 + [0] * 9 + [1] * 4 + [0] * 7)] * 6, [Labelled([1] * 6 + [0] * 8)]
+    got = score_neighbours(Known(), train, held_out, rounds=3)
+    assert got["accuracy"] == 1 and got["untrained"] == 0 and got["thesis_protocol"] == 1
+    assert got["majority"] == 0.5 and got["classes"] == 2 and got["n"] == 2 and got["confusion"] == [[1, 0], [0, 1]]
+
+
 def test_a_boundary_counts_once_and_within_three_frames():
     from intabs.evaluate.boundaries import precision_recall_f1
 

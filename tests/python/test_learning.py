@@ -18,7 +18,7 @@ from intabs.demonstrate.pick_place import PickPlace  # noqa: E402
 from intabs.errors import UserError  # noqa: E402
 from intabs.model.space import state_of  # noqa: E402
 from intabs.train.objective import kl_between, kl_to_standard_normal  # noqa: E402
-from intabs.train.trainer import Trainer, load_config, load_model, load_space  # noqa: E402
+from intabs.train.trainer import Trainer, file_hash, load_config, load_model, load_space  # noqa: E402
 from intabs.train.windows import WindowSampler, augmented, disturbed, prepare  # noqa: E402
 
 SMALL = [
@@ -340,6 +340,48 @@ def test_padding_does_not_change_what_an_encoder_says():
             torch.testing.assert_close(got[row], net(x[row : row + 1, :n])["mean"][0])
 
 
+@pytest.mark.parametrize(
+    "agent, slots, environment", [(7, 4, 0), (29, 1, 0), (63, 4, 0), (9, 1, 14), (8, 4, 0), (8, 2, 0)]
+)
+def test_the_kinds_that_are_compared_have_as_many_parameters(agent, slots, environment):
+    """The Lite 6, grab_hand, the human set, kitchen, robosuite, RoboTurk's Sawyer."""
+    from intabs.model.networks import InteractionAbstractions
+    from intabs.model.space import Space
+
+    arm = _core.ArmModel.lite6() if agent == 7 else None
+    models = [
+        InteractionAbstractions(load_config(kind, [])["model"], Space(agent, slots, environment, arm))
+        for kind in ("intabs-small", "tvi", "tvi-agent")
+    ]
+    ours, *others = [sum(p.numel() for p in m.parameters()) for m in models]
+    assert all(abs(n / ours - 1) < 0.05 for n in others)
+
+
+def test_the_curves_are_for_tensorboard_too(data, tmp_path):
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    train(data, tmp_path / "run")
+    events = EventAccumulator(str(tmp_path / "run")).Reload()
+    logged = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert {e["of"] for e in logged} == {"train", "valid"}
+    for entry in logged:
+        for k, v in entry.items():
+            if k not in ("step", "of"):
+                (point,) = events.Scalars(f"{entry['of']}/{k}")
+                assert point.step == entry["step"] and point.value == pytest.approx(v, rel=1e-4)
+
+
+def test_the_bench_times_three_ways_that_agree():
+    from intabs.train.bench import bench
+
+    figures = bench("intabs-small", rounds=1)
+    assert list(figures["rows"]) == ["intabs", "loop", "torch.nn.LSTM"] and set(figures["ratios"]) == {
+        "loop",
+        "torch.nn.LSTM",
+    }
+    assert all(row["p50_ms"] > 0 and row["n"] == 1 for row in figures["rows"].values())
+
+
 def test_the_same_seed_gives_the_same_weights_and_another_seed_does_not(data, tmp_path):
     a = train(data, tmp_path / "a").model.state_dict()
     b = train(data, tmp_path / "b").model.state_dict()
@@ -467,6 +509,9 @@ def test_exported_weights_give_the_same_numbers_in_cpp(data, tmp_path):
     figures = export(tmp_path / "run", out, trials=0)
     assert figures["max_abs_error"] < 1e-5
     assert verify(out) == figures["max_abs_error"]
+    training = json.loads((out / "manifest.json").read_text())["training"]
+    assert training["data_sha256"] == file_hash(data) and (training["replays"], training["replays_sha256"]) == (0, "")
+    assert training["code_version"] == load_model(tmp_path / "run")[1]["code_version"] != ""
     for name in ("log.jsonl", "result.json"):  # what the training was goes with them
         assert (out / name).read_text() == (tmp_path / "run" / name).read_text() != ""
     errors = [figures["formats"][form]["rms_rad"] for form in ("fp32", "16", "8")]

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 
 from intabs import paths
+from intabs.data import edit, importers
 from intabs.data.reader import DemoFile
 from intabs.errors import UserError
 from intabs.evaluate.evaluate import evaluate
@@ -24,6 +25,8 @@ THESIS = {
     "robomimic": ("RoboMimic", 2.09, 0.84, 0.58),
     "kitchen": ("FrankaKitchen", 1.85, 0.53, 0.32),
 }
+HANDFUL = 20  # of fewer imported demonstrations pieces are held out, of more whole ones
+PIECE, PIECES_HELD_OUT, HELD_OUT = 30, 0.25, 0.1  # frames of a piece; shares
 
 
 def train(config: str, data: Path, run: Path, seed: int, settings: list[str]) -> None:
@@ -38,10 +41,28 @@ def train(config: str, data: Path, run: Path, seed: int, settings: list[str]) ->
         raise UserError(f"{run}: training failed, see above")
 
 
-def about(path: Path) -> str:
+def imported(kind: str, source: Path, rate: float | None, out: Path, progress) -> Path:
+    """Other people's files as ours, some held out; those that are there already are taken."""
+    if out.exists():
+        return out
+    out.parent.mkdir(parents=True, exist_ok=True)
+    raw, split = (out.with_name(f"{out.stem}.{what}.hdf5") for what in ("raw", "split"))
+    options = importers.Options(say=lambda text: print(f"{source}: {text}", flush=True), rate_hz=rate)
+    few = importers.import_demos(kind, source, raw, options, lambda k, n: progress(k, kind))["demos"] < HANDFUL
+    if few:
+        edit.into_pieces(raw, split, PIECE)
+    edit.split(split if few else raw, split, PIECES_HELD_OUT if few else HELD_OUT, seed=0, apart=False)
+    raw.unlink()
+    return split.rename(out)
+
+
+def about(path: Path) -> dict:
+    """How much there is, in words, and of how many demonstrations."""
     with DemoFile(path) as f:
-        n, masks = len(f), f.masks()
-    return f"{n} demonstrations, {len(masks.get('valid', []))} held out"
+        n, held_out = len(f), len(f.masks().get("valid", []))
+        of = len({f.demo_attrs(k)["piece_of"] for k in range(n)}) if n and "piece_of" in f.demo_attrs(0) else n
+    what = f"{n} demonstrations" if of == n else f"{n} pieces of {of} demonstration{'s' * (of > 1)}"
+    return {"about": f"{what}, {held_out} held out", "demonstrations": of}
 
 
 def rows(name: str, data: Path, runs: Path, seeds: int, settings: list[str], progress) -> dict:
@@ -52,7 +73,7 @@ def rows(name: str, data: Path, runs: Path, seeds: int, settings: list[str], pro
             train(config, data, run, seed, settings)
             sources.append(run)
     out = {unit: evaluate(sources, data, None, unit, progress=progress) for unit in ("segment", "whole")}
-    return {"data": str(data), "about": about(data), **out}
+    return {"data": str(data), **about(data), **out}
 
 
 def both(f: dict, group: str) -> str:
@@ -78,16 +99,18 @@ def text(results: dict) -> str:
             )
         for other, k in r["segment"]["ratios"].items():
             said = ", ".join(
-                f"{n} {k[n][0]:.2f} ({k[n][1]:.2f}-{k[n][2]:.2f})" for n in ("all", "balanced", "position")
+                f"{n} {k[n][0]:.2f} ({k[n][1]:.2f}-{k[n][2]:.2f})"
+                for n in ("all", "balanced", "position", "orientation")
             )
             lines.append(f"- intabs / {other}, segment: {said}")
         if name in THESIS:
             what, hdmp, tvi, ours = THESIS[name]
             lines.append(
-                f"- The thesis on {what} (its own full data, training data): H-DMP {hdmp}, TVI {tvi}, IntAbs {ours}."
+                f"- The thesis on {what} (its own full data, training data): H-DMP {hdmp}, TVI {tvi}, IntAbs {ours}. "
+                f"This table rests on {r['about']}."
             )
-        if r["about"].split()[0].isdigit() and int(r["about"].split()[0]) < 100:
-            lines.append("- A handful of demonstrations, not the full set.")
+        if r["demonstrations"] < HANDFUL:
+            lines.append("- A handful of demonstrations, not a full set.")
         if "knn" in r["segment"]:
             k = r["segment"]["knn"]
             others = f"majority {k['majority']:.3f}, untrained {k['untrained']:.3f}, PCA {k['pca']:.3f}"
@@ -110,9 +133,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="tools/table", description=__doc__.split("\n\n")[0])
     parser.add_argument(
         "--data", action="append", metavar="NAME=FILE",
-        help="demonstrations, HDF5 (`intabs data import`); again for more. Known to the thesis: "
-        + ", ".join(THESIS) + ". Without it: the shipped sets",
+        help="demonstrations, HDF5 of ours; or NAME=KIND:SOURCE, other people's files, imported first (KIND: "
+        + ", ".join(importers.KINDS) + f"; of fewer than {HANDFUL} demonstrations pieces are held out). "
+        "Again for more. Names known to the thesis: " + ", ".join(THESIS) + ". Without it: the shipped sets",
     )  # fmt: skip
+    parser.add_argument("--rate", type=float, help="resample what is imported to this rate [Hz]")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--runs", type=Path, default=Path("runs/table"), help="where trainings are kept")
     parser.add_argument("--set", action="append", default=[], help="a setting of the trainings, e.g. train.steps=1000")
@@ -123,10 +148,19 @@ def main() -> None:
         results = {}
         for item in o.data or shipped:
             name, sep, file = item.partition("=")
-            if not sep or not Path(file).exists():
-                raise UserError(f"--data {item}: write NAME=FILE.hdf5, a file that is there")
+            kind, colon, source = file.partition(":")
+            foreign = bool(colon) and kind in importers.KINDS
+            if not sep or not Path(source if foreign else file).expanduser().exists():
+                raise UserError(
+                    f"--data {item}: write NAME=FILE.hdf5, a file that is there, or NAME=KIND:SOURCE (kinds: "
+                    f"{', '.join(importers.KINDS)})"
+                )
             with Progress(name, total=0) as progress:
-                results[name] = rows(name, Path(file), o.runs, o.seeds, o.set, progress.update)
+                data = Path(file)
+                if foreign:
+                    out = o.runs / f"{name}.hdf5"
+                    data = imported(kind, Path(source).expanduser(), o.rate, out, progress.update)
+                results[name] = rows(name, data, o.runs, o.seeds, o.set, progress.update)
     except UserError as e:
         raise SystemExit(f"{parser.prog}: {e}") from None
     write_json(o.json, results)

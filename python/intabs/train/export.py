@@ -187,6 +187,8 @@ def _write(
         "policy_period_us": 40000,
         "training": {
             "data_sha256": checkpoint["data"]["sha256"],
+            "replays_sha256": checkpoint["data"]["replays_sha256"],
+            "replays": checkpoint["data"]["replays"],
             "config": checkpoint["config"],
             "space": checkpoint["space"],
             "seed": checkpoint["seed"],

@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import subprocess
 import sys
 import time
 from dataclasses import replace
@@ -17,7 +18,7 @@ import torch
 import yaml
 from torch import distributed
 
-from intabs import __version__, _core
+from intabs import __version__, _core, paths
 from intabs.data.demos import Demo
 from intabs.data.reader import DemoFile
 from intabs.errors import UserError
@@ -110,6 +111,16 @@ def _merged(base: dict, changes: dict, path: Path) -> dict:
 
 def file_hash(path: Path | str) -> str:
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+
+
+def code_version() -> str:
+    """The package's, and where git knows it the commit, "-dirty" if files differ from it."""
+    try:
+        command = ["git", "-C", str(paths.ROOT), "describe", "--always", "--dirty", "--abbrev=12"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    except (OSError, subprocess.TimeoutExpired):
+        return __version__
+    return f"{__version__} {done.stdout.strip()}".strip()
 
 
 def load_space(demos: list[Demo], objects: str = "gripper", rotation: str = "columns") -> Space:
@@ -225,6 +236,7 @@ class Trainer:
         self.rng = np.random.default_rng(seed)
         self.step = 0
         self.seconds = 0.0
+        self.code_version = code_version()
         self.best = (math.inf, 0)  # loss on what is held out, and the step
 
     def _rate(self, step: int) -> float:
@@ -515,7 +527,7 @@ class Trainer:
                     "replays_sha256": file_hash(self.replays) if self.replays else "",
                     "replays": len(self.sampler.demonstrations) - len(self.recorded),
                 },
-                "code_version": __version__,
+                "code_version": self.code_version,
                 "seed": self.seed,
                 "step": self.step,
                 "seconds": self.seconds,
