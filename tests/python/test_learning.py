@@ -357,6 +357,16 @@ def test_the_kinds_that_are_compared_have_as_many_parameters(agent, slots, envir
     assert all(abs(n / ours - 1) < 0.05 for n in others)
 
 
+def test_settings_are_numbers_however_they_are_written_and_others_are_named():
+    assert load_config("intabs-small", ["train.lr=3e-3"])["train"]["lr"] == 3e-3
+    assert load_config("intabs-small", ["train.clip=2"])["train"]["clip"] == 2.0
+    for wrong in ("train.lr=fast", "train.lr=true", "train.steps=1.5", "train.steps=many"):
+        with pytest.raises(UserError, match="wants a value like"):
+            load_config("intabs-small", [wrong])
+    with pytest.raises(UserError, match="no such setting"):
+        load_config("intabs-small", ["train.speed=1"])
+
+
 def test_the_curves_are_for_tensorboard_too(data, tmp_path):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 

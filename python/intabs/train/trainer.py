@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import hashlib
 import json
 import math
@@ -78,8 +79,9 @@ def load_config(name_or_file: str, overrides: list[str]) -> dict:
         if not sep or not isinstance(node, dict) or last not in node:
             raise UserError(f"--set {item}: no such setting; write group.name=value, e.g. train.steps=1000")
         new = yaml.safe_load(value)
-        if isinstance(node[last], float) and isinstance(new, int) and not isinstance(new, bool):
-            new = float(new)
+        if isinstance(node[last], float) and not isinstance(new, bool):
+            with contextlib.suppress(TypeError, ValueError):
+                new = float(new)  # an integer, or 3e-3, which YAML takes for text
         if type(new) is not type(node[last]):
             raise UserError(f"--set {item}: wants a value like {node[last]}")
         node[last] = new
