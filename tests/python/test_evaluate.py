@@ -109,9 +109,25 @@ def test_pca_with_all_components_rebuilds_its_training_and_with_few_does_not(tra
     m = train[2]
     cuts = fixed_cuts(len(m), 14)
     assert cuts == [0, 13, 26, 39]
-    exact = errors(Pca(train, scaling, 14, agent=36, environment=144).reconstruct(of(m), cuts), m, scaling)
-    coarse = errors(Pca(train, scaling, 14, agent=1, environment=1).reconstruct(of(m), cuts), m, scaling)
+    exact = errors(Pca(train, scaling, 14, (36, 144)).reconstruct(of(m), cuts), m, scaling)
+    coarse = errors(Pca(train, scaling, 14, (1, 1)).reconstruct(of(m), cuts), m, scaling)
     assert exact["all"] < 5e-3 < 5e-2 < coarse["all"]
+
+
+def test_components_are_shared_out_by_what_moves():
+    from intabs.evaluate.baselines import share_out
+
+    rng = np.random.default_rng(0)
+
+    def course(ways: int, width: int, size: float) -> np.ndarray:
+        """(200, 5, width) of so many independent ways to move, each as large."""
+        basis = np.linalg.qr(rng.normal(size=(5 * width, ways)))[0]
+        return (size * rng.normal(size=(200, ways)) @ basis.T).reshape(200, 5, width)
+
+    quiet = course(3, 6, 1e-3)
+    assert share_out(course(6, 4, 1.0), course(2, 6, 1.0) + quiet, 3, size=8) == (6, 2)
+    assert share_out(course(2, 4, 1.0), course(6, 6, 1.0) + quiet, 3, size=8) == (2, 6)
+    assert share_out(course(2, 4, 1.0), np.zeros((200, 5, 0)), 0, size=8) == (8, 0)
 
 
 def lite6_demo(ticks=30, seed=0):

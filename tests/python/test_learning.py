@@ -315,6 +315,31 @@ def test_recorded_changes_move_the_state_to_the_next_one(demonstrations):
     assert (got.p - after.p)[seen].abs().max() < 1e-4 and (got.R - after.R)[seen].abs().max() < 1e-3
 
 
+def test_z_has_the_sizes_that_are_asked_for(data, tmp_path):
+    for latent in ([12, 4], [8, 8]):
+        model = train(data, tmp_path / str(latent[0]), steps=1, extra=[f"model.latent={latent}"]).model
+        assert [q.spec["heads"]["mean"] for q in model.encoders.values()] == latent
+    for wrong in ([8, 9], [16, 0], [16]):
+        with pytest.raises(UserError, match="add up to 16"):
+            train(data, tmp_path / "wrong", steps=1, extra=[f"model.latent={wrong}"])
+
+
+def test_what_the_tip_carries_asks_for_no_numbers_of_its_own(demonstrations):
+    """The block of pick_place moves as the tip does: z^e says next to nothing that z^r does not."""
+    from intabs.evaluate.metrics import Scaling, motion_of
+    from intabs.train.linear import measure
+    from intabs.train.objective import RolloutError
+
+    found, space = demonstrations
+    error = RolloutError(Scaling.fit([motion_of(d.state) for d in found]))
+    motion = measure(space, WindowSampler(found, space, 30, (8, 24)), error)
+    with_carried = torch.cat([space.between(d.state[:-1], d.state[1:])[1] for d in found])
+    assert with_carried.square().sum() > 100
+    free = motion.coefficients["environment"].square().mean()
+    assert free < 0.05 * with_carried.square().mean()
+    assert motion.sizes()[0] > 10
+
+
 def test_training_starts_at_the_principal_components(data, tmp_path):
     """The linear paths alone rebuild skills far better than random ones."""
     config = [*SMALL, "train.steps=1"]
@@ -668,7 +693,9 @@ def test_evaluate_compares_kinds_of_runs_and_names_what_is_missing(data, tmp_pat
         runs.append(run)
     figures = evaluate(runs, data, None, "whole")
     assert list(figures["methods"])[:3] == ["intabs", "tvi", "tvi-agent"] and figures["seeds"] == 2
-    assert figures["usage"]["of"] == [8, 8] and figures["usage"]["skills"] > 0 and max(figures["usage"]["active"]) <= 8
+    usage, latent = figures["usage"], load_model(runs[0])[1]["config"]["model"]["latent"]
+    assert usage["of"] == latent and sum(latent) == 16 and min(latent) > 0 and usage["skills"] > 0
+    assert all(n <= most for n, most in zip(usage["active"], latent, strict=True))
     assert figures["methods"]["intabs"]["sd"] > 0 == figures["methods"]["tvi"]["sd"]
     ratio, low, high = figures["ratios"]["still"]["all"]
     assert low <= ratio <= high

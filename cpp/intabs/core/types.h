@@ -14,7 +14,7 @@ inline constexpr int kNumJoints = 6;
 inline constexpr int kMaxObjects = 4;
 inline constexpr int kMaxTags = 10;     // a TAG_DETECTIONS message
 inline constexpr int kMaxCameras = 4;   // a PERCEPTION_STATUS message
-inline constexpr int kLatentDim = 16;  // z = [z_agent(8), z_environment(8)]
+inline constexpr int kLatentDim = 16;  // z = [z_agent, z_environment]; how many of each, the encoders say
 
 inline constexpr int64_t kDriverPeriodUs = 4000;   // 250 Hz
 inline constexpr int64_t kPolicyPeriodUs = 40000;  // 25 Hz; a policy's manifest must agree

@@ -42,7 +42,7 @@ def register(app: typer.Typer) -> None:
         json: Json = None,
     ) -> None:
         """One skill: z, durations, where its objects began and ended; a drawing with --out."""
-        from intabs.skills.library import Library, drawing, weights_folder
+        from intabs.skills.library import Library, drawing, latent_sizes, weights_folder
 
         library = Library.load(weights_folder(weights))
         if not 0 <= index < len(library.skills):
@@ -51,8 +51,10 @@ def register(app: typer.Typer) -> None:
         write_json(json, {"skills": [_figures(s)]})
         print(f"skill {index}: {s.task}, {s.source}, the {s.number + 1}. of it; {s.effect}")
         print(f"  lasts {s.ticks} ticks of 40 ms ({s.min_ticks} to {s.max_ticks})")
-        print("  z agent       " + " ".join(f"{v:6.2f}" for v in s.z[:8]))
-        print("  z environment " + " ".join(f"{v:6.2f}" for v in s.z[8:]))
+        at = 0
+        for name, size in latent_sizes(weights_folder(weights)).items():
+            print(f"  z {name:11} " + " ".join(f"{v:6.2f}" for v in s.z[at : at + size]))
+            at += size
         for slot in range(4):
             places = [f.object_pose[slot, :3] for f in (s.frames[0], s.frames[-1]) if f.known[slot]]
             if len(places) == 2:

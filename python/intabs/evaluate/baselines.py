@@ -94,18 +94,47 @@ def training_pieces(motions: list[Motion], segment: int, stride: int = 2) -> lis
     ]
 
 
+def share_out(agent: np.ndarray, environment: np.ndarray, positions: int, size: int = 16) -> tuple[int, int]:
+    """How many of `size` principal components are best of the agent's and how many of the environment's displacement:
+    those with which joints, positions and orientations are left with least, each as long as it is on average.
+    agent (M, ticks, n); environment (M, ticks, m), `positions` numbers first, then orientations; normalised."""
+    if not environment.size:
+        return size, 0
+    parts = [np.linalg.svd(_flat(x) - _flat(x).mean(0), full_matrices=False) for x in (agent, environment)]
+
+    def left(of: int, like: np.ndarray, components: int) -> np.ndarray:
+        U, s, V = parts[of]
+        return ((U[:, components:] * s[components:]) @ V[components:]).reshape(like.shape)
+
+    def cost(k: int) -> float:
+        objects = left(1, environment, size - k)
+        groups = left(0, agent, k), objects[..., :positions], objects[..., positions:]
+        return sum(float(np.linalg.norm(g, axis=-1).mean()) for g in groups)
+
+    k = min(range(1, size), key=cost)
+    return k, size - k
+
+
+def _flat(x: np.ndarray) -> np.ndarray:
+    return x.reshape(len(x), -1)
+
+
 class Pca:
-    """Principal components of the segments' displacement, agent and environment apart, as many numbers as z."""
+    """Principal components of the segments' displacement, agent and environment apart, as many numbers as z; sizes:
+    of each, shared out by the training split where nothing is said."""
 
     name = "pca"
 
-    def __init__(self, train: list[Motion], scaling: Scaling, segment: int, agent: int = 8, environment: int = 8):
+    def __init__(self, train: list[Motion], scaling: Scaling, segment: int, sizes: tuple[int, int] | None = None):
         self.shape = Displacement(scaling)
-        rows = [self.shape.split(m) for m in training_pieces(train, segment)]
+        agent, environment = (
+            np.array(rows) for rows in zip(*map(self.shape.split, training_pieces(train, segment)), strict=True)
+        )
+        ticks = self.shape.N
+        positions = 3 * train[0].p.shape[1] + train[0].environment.shape[1]
+        self.sizes = sizes or share_out(*(x.reshape(len(x), ticks, -1) for x in (agent, environment)), positions)
         self.parts = []
-        for x, k in zip(
-            (np.array([r[0] for r in rows]), np.array([r[1] for r in rows])), (agent, environment), strict=True
-        ):
+        for x, k in zip((agent, environment), self.sizes, strict=True):
             mean = x.mean(0)
             _, _, components = np.linalg.svd(x - mean, full_matrices=False) if x.shape[1] else (0, 0, x[:0])
             self.parts.append((mean, components[:k]))

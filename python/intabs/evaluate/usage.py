@@ -13,15 +13,16 @@ ACTIVE = 0.01  # variance of z's mean over skills: a dimension below it says not
 
 def score_usage(method: Learned, train: list[Demo], demos: list[Demo]) -> dict:
     """Of the skills between learned boundaries: {skills, demonstrations, ticks: median length, active: [of each
-    encoder's half of z, or of the whole where there is one], of: [sizes]}."""
+    encoder's part of z], of: [sizes]}."""
     cuts = method.cuts(train, demos)
     pieces = [[(int(a), int(b)) for a, b in zip(c, c[1:], strict=False) if b > a] for c in cuts]
     z = np.concatenate([method.encode(method.inputs(sample(d)), p).numpy() for d, p in zip(demos, pieces, strict=True)])
-    halves = np.split(z, 2, axis=1) if method.config["model"]["encoders"] == "split" else [z]
+    sizes = [q.spec["heads"]["mean"] for q in method.model.encoders.values()]
+    parts = np.split(z, np.cumsum(sizes)[:-1], axis=1)
     return {
         "skills": len(z),
         "demonstrations": len(demos),
         "ticks": float(np.median([b - a for p in pieces for a, b in p])),
-        "active": [int((half.var(0) > ACTIVE).sum()) for half in halves],
-        "of": [half.shape[1] for half in halves],
+        "active": [int((part.var(0) > ACTIVE).sum()) for part in parts],
+        "of": sizes,
     }

@@ -7,9 +7,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from intabs.errors import UserError
 from intabs.model.space import Space, State, squash
 
-LATENT = 8  # of each of z^r, z^e
+LATENT = 8  # numbers of each of z^r and z^e, where nothing else is said; always twice as many together
 AGE = 20.0  # ticks, unit of a skill's age
 BASIS = 5  # hat functions over a skill's phase
 
@@ -166,8 +167,9 @@ def encoder_inputs(
 class InteractionAbstractions(nn.Module):
     """q^r(z^r | tau^r), q^e(z^e | tau^e), pi(a^r, response, a^e | s, z, phase), eta(b, z of the next | s, z, age).
 
-    config: {encoders: split | joint | agent, encoder, pi, eta: {...}}. All inputs are normalised.
+    config: {encoders: split | joint | agent, latent, encoder, pi, eta: {...}}. All inputs are normalised.
     - split: z = [z^r, z^e] by two encoders; joint: one encoder of both (tvi); agent: one of the agent (tvi-agent).
+    - latent: numbers in z^r and z^e; [0, 0]: LATENT each here, and what the motion asks for when training begins.
     - pi's heads: `agent`, the command (the Lite 6: steps of the joint targets, gripper > 0 closed; else what moves the
       agent); `environment`, a^e. The Lite 6 also has `response`: what the joints will have moved, as a servo lags
       behind its targets and commands added up are not where the arm is; and `carried`, for each object the logit of
@@ -182,8 +184,14 @@ class InteractionAbstractions(nn.Module):
         # What the encoders see each tick.
         self.agent_dim = space.agent + (space.agent if lite6 else 0) + space.joints
         self.environment_dim = space.environment_dim + space.change_dim
+        self.latent = config.get("latent", [0, 0])  # weights of before there was a choice do not say it
+        if self.latent == [0, 0]:
+            self.latent = [LATENT, LATENT]
+        if len(self.latent) != 2 or sum(self.latent) != 2 * LATENT or min(self.latent) < 1:
+            raise UserError(f"model.latent is {self.latent}: write two sizes that add up to {2 * LATENT}, or [0, 0]")
+        agent, environment = self.latent
         inputs = {
-            "split": {"q_agent": (self.agent_dim, LATENT), "q_environment": (self.environment_dim, LATENT)},
+            "split": {"q_agent": (self.agent_dim, agent), "q_environment": (self.environment_dim, environment)},
             "joint": {"q_joint": (self.agent_dim + self.environment_dim, 2 * LATENT)},
             "agent": {"q_agent": (self.agent_dim, 2 * LATENT)},
         }[self.kind]

@@ -128,6 +128,16 @@ def weights_folder(name: Path | str) -> Path:
     return shipped if shipped.is_dir() else Path(name)
 
 
+def latent_sizes(weights: Path) -> dict[str, int]:
+    """How many of z's numbers each encoder says, in z's order: {"agent": 8, "environment": 8}."""
+    path = weights / "manifest.json"
+    try:
+        networks = json.loads(path.read_text())["networks"]
+        return {n.removeprefix("q_"): net["heads"]["mean"] for n, net in networks.items() if n.startswith("q_")}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as e:
+        raise UserError(f"{path}: not a manifest ({type(e).__name__}: {e}); export the weights again") from None
+
+
 def _skill(index: int, d: dict) -> Skill:
     z, moved = np.array(d["z"], "f4"), np.array(d["moved"], "f4")
     if z.shape != (16,) or not np.isfinite(z).all() or moved.shape != (SLOTS,):

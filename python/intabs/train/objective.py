@@ -55,13 +55,17 @@ def termination_error(logit: Tensor, begins: Tensor, mask: Tensor) -> Tensor:
     return mean_over(torch.nn.functional.binary_cross_entropy_with_logits(logit, begins, reduction="none"), mask)
 
 
-def held_error(logit: Tensor, change: Tensor, carried: Tensor, mask: Tensor) -> Tensor:
-    """-log Bernoulli of an object's being held, (M, L, S). The target is how much of the tip's motion the object's own
-    repeats: <change, carried> / |carried|^2 within 0 .. 1; ticks in which the tip hardly moves tell nothing."""
-    slots = logit.shape[-1]
+def share_carried(change: Tensor, carried: Tensor, slots: int) -> tuple[Tensor, Tensor]:
+    """How much of the tip's motion each object's own repeats, <change, carried> / |carried|^2 within 0 .. 1, and
+    |carried|^2: where that is small it tells nothing. (..., change_dim) -> (..., slots)."""
     change, carried = (x[..., : 6 * slots].unflatten(-1, (slots, 6)) for x in (change, carried))
     square = (carried**2).sum(-1)
-    target = ((change * carried).sum(-1) / square.clamp(min=1e-6)).clamp(0, 1)
+    return ((change * carried).sum(-1) / square.clamp(min=1e-6)).clamp(0, 1), square
+
+
+def held_error(logit: Tensor, change: Tensor, carried: Tensor, mask: Tensor) -> Tensor:
+    """-log Bernoulli of an object's being held, (M, L, S)."""
+    target, square = share_carried(change, carried, logit.shape[-1])
     weight = mask[..., None] * (square > 0.05)
     return mean_over(torch.nn.functional.binary_cross_entropy_with_logits(logit, target, reduction="none"), weight)
 

@@ -28,7 +28,7 @@ from intabs.model.networks import InteractionAbstractions, encoder_inputs, phase
 from intabs.model.space import Space, State, state_of
 from intabs.replay.replay import RETURN
 from intabs.train import cutting
-from intabs.train.linear import start_linear
+from intabs.train.linear import measure, start_linear
 from intabs.train.objective import (
     RolloutError,
     action_error,
@@ -220,9 +220,12 @@ class Trainer:
         self.joint_sampler = WindowSampler(train, space, window, segment, augment, **shown)
         valid = prepare(valid_demos, space)
         self.valid = WindowSampler(valid, space, window, segment) if valid else None
-        self.model = InteractionAbstractions(config["model"], space)
         self.rollout_error = RolloutError(self.scaling)
-        start_linear(self.model, self.sampler, self.rollout_error, o["rollout"], seed)
+        motion = measure(space, self.sampler, self.rollout_error)
+        if config["model"]["latent"] == [0, 0]:
+            config["model"]["latent"] = motion.sizes()
+        self.model = InteractionAbstractions(config["model"], space)
+        start_linear(self.model, motion, o["rollout"])
         self.cutter = cutting.Cutter(self.model) if o["cuts"] in cutting.DRAWN else None
         self.cuts = cutting.Cuts(self.model, [d.state for d in recorded], o, self.cutter)
         self.recorded = recorded
