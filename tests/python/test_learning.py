@@ -684,6 +684,7 @@ def test_a_map_shows_every_skill_as_picture_and_as_page(data, tmp_path):
 
 
 def test_evaluate_compares_kinds_of_runs_and_names_what_is_missing(data, tmp_path):
+    from intabs.commands.evaluate import unequal
     from intabs.evaluate.evaluate import evaluate
 
     runs = []
@@ -697,6 +698,13 @@ def test_evaluate_compares_kinds_of_runs_and_names_what_is_missing(data, tmp_pat
     assert usage["of"] == latent and sum(latent) == 16 and min(latent) > 0 and usage["skills"] > 0
     assert all(n <= most for n, most in zip(usage["active"], latent, strict=True))
     assert figures["methods"]["intabs"]["sd"] > 0 == figures["methods"]["tvi"]["sd"]
+    trained = figures["training"]
+    assert [t["steps"] for t in trained.values()] == [2, 2, 2] and unequal(trained)  # encoders as wide, not as large
+    for t in trained.values():
+        t["parameters"] = 30_000
+    assert not unequal(trained)
+    trained["tvi"]["replays"] = 10
+    assert unequal(trained)
     ratio, low, high = figures["ratios"]["still"]["all"]
     assert low <= ratio <= high
     assert figures["methods"]["intabs"]["all"] / figures["methods"]["still"]["all"] == pytest.approx(ratio)

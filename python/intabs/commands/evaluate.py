@@ -53,6 +53,10 @@ def register(app: typer.Typer) -> None:
         for name, f in figures["methods"].items():
             sd = f"   sd {f['sd']:.4f}" if f["sd"] else ""
             print(f"{name:14}" + "".join(f"{f[k]:13.4f}" for k in FIGURES) + f"   n {f['n']}{sd}")
+        trained = figures["training"]
+        if len(trained) > 1 and unequal(trained):
+            each = "; ".join(f"{n} {t['parameters']:,}, {t['steps']:,}, {t['replays']:,}" for n, t in trained.items())
+            print(f"not trained alike (parameters, steps, replays: {each}): tools/table trains them alike")
         if all(k in f for f in figures["methods"].values() for k in FROM_TIP):
             print("objects seen from the gripper")
             for name, f in figures["methods"].items():
@@ -87,6 +91,11 @@ def register(app: typer.Typer) -> None:
             )
         if confusion:
             draw_confusion(figures, data, confusion)
+
+
+def unequal(trained: dict[str, dict[str, int]]) -> bool:
+    """More than 5 % apart in anything."""
+    return any(max(values) > 1.05 * min(values) for values in zip(*(t.values() for t in trained.values()), strict=True))
 
 
 def draw_confusion(figures: dict, data: Path, out: Path) -> None:

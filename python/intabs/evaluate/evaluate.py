@@ -33,15 +33,19 @@ def load_learned(source: Path) -> Learned:
     if (source / "checkpoint.pt").exists():
         model, about = load_model(source)
         cutter = load_cutter(model, about.get("cutter"))
+        steps, replays = about["step"], about["data"]["replays"]
     elif (source / "manifest.json").exists():
         from intabs.train.export import load_weights
 
         model, manifest = load_weights(source)
         about, cutter = manifest["training"], None
+        steps, replays = about["steps"], about.get("replays", 0)
     else:
         raise UserError(f"{source}: neither a run of `intabs train` (checkpoint.pt) nor a folder of weights")
     torch.set_num_threads(1)
-    return Learned(KINDS[model.kind], model, about["config"], cutter)
+    learned = Learned(KINDS[model.kind], model, about["config"], cutter)
+    learned.steps, learned.replays = steps, replays
+    return learned
 
 
 def find_sources(sources: list[Path]) -> list[Path]:
@@ -67,7 +71,8 @@ def evaluate(
 ) -> dict:
     """Several sources of a kind are several seeds of one method; methods None: all that there are.
 
-    {methods: {name: {all, balanced, joints, position, orientation, sd, n}}, usage, knn, boundaries, ratios, seeds}:
+    {methods: {name: {all, balanced, joints, position, orientation, sd, n}}, training: {name: {parameters, steps,
+    replays}}, usage, knn, boundaries, ratios, seeds}:
     means over held-out demonstrations, or over all their segments; sd over seeds, of `all`; for the Lite 6 also
     FROM_TIP.
     ratios: of the first method's figures to the others', with 95 % intervals (bootstrap over held-out demonstrations,
@@ -137,6 +142,7 @@ def evaluate(
         "unit": unit,
         "segment": segment,
         "seeds": max(len(x) for x in learned.values()),
+        "training": {name: learned[name][0].training for name in names if name in learned},
         "ratios": ratios(rows, [i for i, _, _ in pieces]),
     }
     main = learned.get("intabs") or next(iter(learned.values()))

@@ -19,6 +19,13 @@ class Learned:
         self, name: str, model: InteractionAbstractions, config: dict | None = None, cutter: Cutter | None = None
     ):
         self.name, self.model, self.config, self.cutter = name, model.eval(), config, cutter
+        self.steps, self.replays = 0, 0  # of the training, where it is known
+
+    @property
+    def training(self) -> dict[str, int]:
+        """What a comparison ought to have in common."""
+        numbers = sum(p.numel() for p in self.model.parameters())
+        return {"parameters": numbers, "steps": self.steps, "replays": self.replays}
 
     @property
     def cuts_itself(self) -> bool:
