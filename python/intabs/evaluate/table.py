@@ -25,6 +25,7 @@ THESIS = {
     "robomimic": ("RoboMimic", 2.09, 0.84, 0.58),
     "kitchen": ("FrankaKitchen", 1.85, 0.53, 0.32),
 }
+FOREIGN = [k for k in importers.KINDS if k != "npz"]  # which wants to be told the names of its arrays
 HANDFUL = 20  # of fewer imported demonstrations pieces are held out, of more whole ones
 PIECE, PIECES_HELD_OUT, HELD_OUT = 30, 0.25, 0.1  # frames of a piece; shares
 
@@ -134,7 +135,7 @@ def main() -> None:
     parser.add_argument(
         "--data", action="append", metavar="NAME=FILE",
         help="demonstrations, HDF5 of ours; or NAME=KIND:SOURCE, other people's files, imported first (KIND: "
-        + ", ".join(importers.KINDS) + f"; of fewer than {HANDFUL} demonstrations pieces are held out). "
+        + ", ".join(FOREIGN) + f"; of fewer than {HANDFUL} demonstrations pieces are held out). "
         "Again for more. Names known to the thesis: " + ", ".join(THESIS) + ". Without it: the shipped sets",
     )  # fmt: skip
     parser.add_argument("--rate", type=float, help="resample what is imported to this rate [Hz]")
@@ -149,11 +150,11 @@ def main() -> None:
         for item in o.data or shipped:
             name, sep, file = item.partition("=")
             kind, colon, source = file.partition(":")
-            foreign = bool(colon) and kind in importers.KINDS
+            foreign = bool(colon) and kind in FOREIGN
             if not sep or not Path(source if foreign else file).expanduser().exists():
                 raise UserError(
                     f"--data {item}: write NAME=FILE.hdf5, a file that is there, or NAME=KIND:SOURCE (kinds: "
-                    f"{', '.join(importers.KINDS)})"
+                    f"{', '.join(FOREIGN)})"
                 )
             with Progress(name, total=0) as progress:
                 data = Path(file)
