@@ -289,6 +289,34 @@ def test_the_table_takes_files_as_they_come(tmp_path, lengths):
     assert imported("kitchen", source, None, out, lambda done, text: None) == out
 
 
+def test_one_command_from_a_file_of_others_to_the_table(tmp_path, monkeypatch, capsys):
+    torch = pytest.importorskip("torch")
+    torch.set_num_threads(1)
+    from intabs.evaluate import table
+
+    source = d4rl(tmp_path / "play.hdf5", [60, 90])
+    small = ("train.steps=2", "train.batch=4", "train.warmup=1", "objective.window=20")
+    arguments = [
+        "--data",
+        f"kitchen=kitchen:{source}",
+        "--rate",
+        "10",
+        "--seeds",
+        "1",
+        "--runs",
+        str(tmp_path / "runs"),
+    ]
+    monkeypatch.setattr("sys.argv", ["table", *arguments, *(x for s in small for x in ("--set", s))])
+    table.main()
+    said = capsys.readouterr().out
+    assert "## kitchen: 4 pieces of 2 demonstrations, 1 held out" in said and "A handful of demonstrations" in said
+    assert "| intabs |" in said and "| tvi-agent |" in said and "IntAbs 0.32" in said
+    # The same name for something else is not the same run.
+    monkeypatch.setattr("sys.argv", ["table", *arguments, "--set", "train.steps=3"])
+    with pytest.raises(SystemExit, match="kitchen/intabs-small-0: was trained with other settings"):
+        table.main()
+
+
 PENDULUM = """<mujoco><worldbody>
   <body name="robot0_base"><body name="robot0_link1"><joint name="robot0_joint1"/>
     <body name="robot0_link2"><joint name="robot0_joint2"/>

@@ -216,6 +216,29 @@ def test_slots_without_an_object_do_not_change_z():
     assert not torch.allclose(learned.encode(learned.inputs(sample(demo)), pieces), want)
 
 
+def test_nor_do_they_for_a_hand():
+    from intabs.model.networks import InteractionAbstractions, encoder_inputs
+    from intabs.model.space import Space, State
+    from intabs.train.trainer import load_config
+
+    torch.manual_seed(0)
+    model = InteractionAbstractions(load_config("intabs-small", [])["model"], Space(63, 4, 0)).eval()
+    known = torch.tensor([1.0, 1.0, 0.0, 0.0]).expand(20, 4)
+    s = State(
+        torch.randn(20, 63), torch.randn(20, 4, 3), torch.eye(3).repeat(20, 4, 1, 1), torch.zeros(20, 0), known, known
+    )
+
+    def z() -> torch.Tensor:
+        inputs = encoder_inputs(model.space, model.space.features(s[:-1])[0], None, *model.space.between(s[:-1], s[1:]))
+        return model.encode(*(x[None] for x in inputs))[0]
+
+    want = z()
+    s.p[:, 2:] += torch.randn(20, 2, 3)  # nonsense where nobody saw an object
+    torch.testing.assert_close(z(), want)
+    s.p[:, 1] += torch.randn(20, 3)
+    assert not torch.allclose(z(), want)
+
+
 @pytest.mark.parametrize("make", ["FaithfulHdmp", "Hdmp"])
 def test_movement_primitives_come_close_to_the_motion_they_are_fitted_to(train, make):
     from intabs.evaluate import hdmp

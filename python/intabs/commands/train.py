@@ -20,7 +20,7 @@ class Device(StrEnum):
 def register(app: typer.Typer) -> None:
     @app.command()
     def train(
-        config: Annotated[str, typer.Option(help="intabs, intabs-small, or a YAML file of that form.")],
+        config: Annotated[str, typer.Option(help="intabs, intabs-small, tvi, tvi-agent, or a YAML file of that form.")],
         data: Annotated[Path, typer.Option(help="Demonstrations, HDF5.")],
         out: Annotated[Path, typer.Option(help="Folder of the run: checkpoint, TensorBoard curves, result.json.")],
         replays: Annotated[
@@ -41,15 +41,18 @@ def register(app: typer.Typer) -> None:
             import torch
         except ImportError:
             raise UserError("torch is not installed: run tools/setup (without --runtime-only)") from None
-        from intabs.train.trainer import Trainer, end_together, load_config
+        from intabs.train.trainer import Trainer, end_together, load_checkpoint, load_config
 
         if device is Device.cuda and not torch.cuda.is_available():
             raise UserError("--device cuda: torch sees no GPU here; leave it out")
-        trainer = Trainer(load_config(config, set_ or []), data, out, seed, device.value, replays)
+        settings = load_config(config, set_ or [])
+        if resume and settings["model"]["latent"] == [0, 0]:  # as they were found when it began
+            settings["model"]["latent"] = load_checkpoint(out)["config"]["model"].get("latent", [0, 0])
+        elif not resume and (out / "checkpoint.pt").exists():
+            raise UserError(f"{out / 'checkpoint.pt'} is there already: add --resume, or give another --out")
+        trainer = Trainer(settings, data, out, seed, device.value, replays)
         if resume:
             trainer.resume()
-        elif trainer.path.exists():
-            raise UserError(f"{trainer.path} is there already: add --resume, or give another --out")
         if trainer.rank > 0:
             trainer.train()
             end_together()

@@ -33,18 +33,18 @@ def load_learned(source: Path) -> Learned:
     if (source / "checkpoint.pt").exists():
         model, about = load_model(source)
         cutter = load_cutter(model, about.get("cutter"))
-        steps, replays = about["step"], about["data"]["replays"]
+        steps, replays, sha256 = about["step"], about["data"]["replays"], about["data"]["sha256"]
     elif (source / "manifest.json").exists():
         from intabs.train.export import load_weights
 
         model, manifest = load_weights(source)
         about, cutter = manifest["training"], None
-        steps, replays = about["steps"], about.get("replays", 0)
+        steps, replays, sha256 = about["steps"], about.get("replays", 0), about["data_sha256"]
     else:
         raise UserError(f"{source}: neither a run of `intabs train` (checkpoint.pt) nor a folder of weights")
     torch.set_num_threads(1)
     learned = Learned(KINDS[model.kind], model, about["config"], cutter)
-    learned.steps, learned.replays = steps, replays
+    learned.steps, learned.replays, learned.data_sha256 = steps, replays, sha256
     return learned
 
 
@@ -71,13 +71,15 @@ def evaluate(
 ) -> dict:
     """Several sources of a kind are several seeds of one method; methods None: all that there are.
 
-    {methods: {name: {all, balanced, joints, position, orientation, sd, n}}, training: {name: {parameters, steps,
-    replays}}, usage, knn, boundaries, ratios, seeds}:
+    {methods: {name: {all, balanced, joints, position, orientation, sd, n}}, training: {name: [{parameters, steps,
+    replays, data_sha256}]}, data_sha256, usage, knn, boundaries, ratios, seeds}:
     means over held-out demonstrations, or over all their segments; sd over seeds, of `all`; for the Lite 6 also
     FROM_TIP.
     ratios: of the first method's figures to the others', with 95 % intervals (bootstrap over held-out demonstrations,
-    paired).
+    paired; nan of a single one). usage and boundaries are the first seed's.
     """
+    from intabs.train.trainer import file_hash
+
     unknown = [m for m in methods or () if m not in METHODS]
     if unknown:
         raise UserError(f"--methods {unknown[0]}: known are {', '.join(METHODS)}")
@@ -142,7 +144,8 @@ def evaluate(
         "unit": unit,
         "segment": segment,
         "seeds": max(len(x) for x in learned.values()),
-        "training": {name: learned[name][0].training for name in names if name in learned},
+        "training": {name: [m.training for m in learned[name]] for name in names if name in learned},
+        "data_sha256": file_hash(data),
         "ratios": ratios(rows, [i for i, _, _ in pieces]),
     }
     main = learned.get("intabs") or next(iter(learned.values()))
@@ -172,6 +175,6 @@ def ratios(rows: dict[str, list[list[dict]]], demo: list[int], draws: int = 2000
         for k in FIGURES:
             a, b = values[first][k], values[name][k]
             drawn = [a[p].mean() / max(b[p].mean(), 1e-12) for p in picks]
-            low, high = np.quantile(drawn, [0.025, 0.975])
+            low, high = np.quantile(drawn, [0.025, 0.975]) if len(groups) > 1 else (np.nan, np.nan)
             out[name][k] = [float(a.mean() / max(b.mean(), 1e-12)), float(low), float(high)]
     return out

@@ -78,7 +78,11 @@ class Codes:
 
 def predicted(base: list[np.ndarray], labels: np.ndarray, query: list[np.ndarray]) -> list[np.ndarray]:
     """For each seed; numbers in deviations of the base."""
-    return [neighbours(b / b.std(0), labels, q / b.std(0)) for b, q in zip(base, query, strict=True)]
+    return [neighbours(b / _deviation(b), labels, q / _deviation(b)) for b, q in zip(base, query, strict=True)]
+
+
+def _deviation(x: np.ndarray) -> np.ndarray:
+    return np.where(x.std(0) > 0, x.std(0), 1.0)  # what is always the same tells nothing
 
 
 def score_compositions(codes: Codes, train: list[Demo], held_out: list[Demo]) -> dict | None:
@@ -107,7 +111,7 @@ def score_compositions(codes: Codes, train: list[Demo], held_out: list[Demo]) ->
 
 def score_neighbours(codes: Codes, train: list[Demo], held_out: list[Demo], rounds: int = 50) -> dict:
     """All held-out pieces against all of the training split; and the thesis' protocol: 150 base and 50 query pieces,
-    drawn `rounds` times."""
+    drawn `rounds` times. Of several seeds means; the thesis' protocol and the confusion are the first one's."""
     sides = []
     for demos in (train, held_out):
         pieces = [label_pieces(d.extra["labels"]) for d in demos]
@@ -121,8 +125,8 @@ def score_neighbours(codes: Codes, train: list[Demo], held_out: list[Demo], roun
     for _ in range(rounds):
         b = rng.permutation(len(base_labels))[:150]
         q = rng.permutation(len(query_labels))[:50]
-        x, y = base["z"][0], query["z"][0]
-        thesis.append((neighbours(x[b] / x.std(0), base_labels[b], y[q] / x.std(0)) == query_labels[q]).mean())
+        x, y = (side["z"][0] / _deviation(base["z"][0]) for side in (base, query))
+        thesis.append((neighbours(x[b], base_labels[b], y[q]) == query_labels[q]).mean())
     classes = int(max(base_labels.max(), query_labels.max())) + 1
     return {
         "accuracy": accuracy["z"],

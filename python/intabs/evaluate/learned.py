@@ -19,13 +19,13 @@ class Learned:
         self, name: str, model: InteractionAbstractions, config: dict | None = None, cutter: Cutter | None = None
     ):
         self.name, self.model, self.config, self.cutter = name, model.eval(), config, cutter
-        self.steps, self.replays = 0, 0  # of the training, where it is known
+        self.steps, self.replays, self.data_sha256 = 0, 0, ""  # of the training, where it is known
 
     @property
-    def training(self) -> dict[str, int]:
+    def training(self) -> dict[str, int | str]:
         """What a comparison ought to have in common."""
         numbers = sum(p.numel() for p in self.model.parameters())
-        return {"parameters": numbers, "steps": self.steps, "replays": self.replays}
+        return {"parameters": numbers, "steps": self.steps, "replays": self.replays, "data_sha256": self.data_sha256}
 
     @property
     def cuts_itself(self) -> bool:

@@ -25,12 +25,26 @@ THESIS = {
     "robomimic": ("RoboMimic", 2.09, 0.84, 0.58),
     "kitchen": ("FrankaKitchen", 1.85, 0.53, 0.32),
 }
-FOREIGN = [k for k in importers.KINDS if k != "npz"]  # which wants to be told the names of its arrays
+FOREIGN = ("robosuite", "robomimic", "roboturk", "kitchen")  # of importers.KINDS those that hold objects and say which
 HANDFUL = 20  # of fewer imported demonstrations pieces are held out, of more whole ones
 PIECE, PIECES_HELD_OUT, HELD_OUT = 30, 0.25, 0.1  # frames of a piece; shares
 
 
+def check_same(config: str, data: Path, run: Path, settings: list[str]) -> None:
+    """Raises UserError where a run that is there came from other settings or data."""
+    from intabs.train.trainer import file_hash, load_checkpoint, load_config
+
+    there, want = load_checkpoint(run), load_config(config, settings)
+    if want["model"]["latent"] == [0, 0]:
+        want["model"]["latent"] = there["config"]["model"].get("latent")
+    what = "data" if there["data"]["sha256"] != file_hash(data) else "settings" if there["config"] != want else ""
+    if what:
+        raise UserError(f"{run}: was trained with other {what}; name another --runs, or remove it")
+
+
 def train(config: str, data: Path, run: Path, seed: int, settings: list[str]) -> None:
+    if (run / "checkpoint.pt").exists():
+        check_same(config, data, run, settings)
     if (run / "result.json").exists():
         return
     command = [sys.executable, "-m", "intabs.cli", "train", "--config", config, "--data", str(data), "--out", str(run)]
@@ -43,7 +57,7 @@ def train(config: str, data: Path, run: Path, seed: int, settings: list[str]) ->
 
 
 def imported(kind: str, source: Path, rate: float | None, out: Path, progress) -> Path:
-    """Other people's files as ours, some held out; those that are there already are taken."""
+    """Other people's files as ours, some held out anew; a file that is there already is taken."""
     if out.exists():
         return out
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -159,7 +173,7 @@ def main() -> None:
             with Progress(name, total=0) as progress:
                 data = Path(file)
                 if foreign:
-                    out = o.runs / f"{name}.hdf5"
+                    out = o.runs / (f"{name}.hdf5" if o.rate is None else f"{name}-{o.rate:g}Hz.hdf5")
                     data = imported(kind, Path(source).expanduser(), o.rate, out, progress.update)
                 results[name] = rows(name, data, o.runs, o.seeds, o.set, progress.update)
     except UserError as e:

@@ -1,6 +1,7 @@
-"""What forward and backward of joint training cost without its rollouts, three ways in one run: `tools/bench_training`.
+"""What forward and backward of the networks cost in joint training, without rollouts and losses, three ways in one
+run: `tools/bench_training`.
 
-- intabs: as training does it, each network once over all ticks of all skills.
+- intabs: as training does it, each network once over all ticks of all skills, the encoders with masks.
 - loop: the same networks and numbers, tick by tick over the batch.
 - torch.nn.LSTM: its own stacks of the same sizes on the same inputs, with nothing around them.
 """
@@ -86,8 +87,11 @@ def bench(config: str, rounds: int) -> dict:
     def total(heads: dict[str, Tensor]) -> Tensor:
         return sum(y.square().mean() for y in heads.values())
 
+    mask = torch.ones(skills, SKILL)
+
     def ours() -> Tensor:
-        return sum(total(net(inputs[name])) for name, net in model.networks().items())
+        nets = model.networks().items()
+        return sum(total(net(inputs[name], mask if net.bidirectional else None)) for name, net in nets)
 
     def loop() -> Tensor:
         return sum(total(tick_by_tick(net, inputs[name])) for name, net in model.networks().items())

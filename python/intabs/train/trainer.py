@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import copy
 import hashlib
 import json
 import math
@@ -24,7 +25,7 @@ from intabs.data.demos import Demo
 from intabs.data.reader import DemoFile
 from intabs.errors import UserError
 from intabs.evaluate.metrics import Scaling, motion_of
-from intabs.model.networks import InteractionAbstractions, encoder_inputs, phase, phase_basis
+from intabs.model.networks import LATENT, InteractionAbstractions, encoder_inputs, phase, phase_basis
 from intabs.model.space import Space, State, state_of
 from intabs.replay.replay import RETURN
 from intabs.train import cutting
@@ -82,7 +83,7 @@ def load_config(name_or_file: str, overrides: list[str]) -> dict:
         if isinstance(node[last], float) and not isinstance(new, bool):
             with contextlib.suppress(TypeError, ValueError):
                 new = float(new)  # an integer, or 3e-3, which YAML takes for text
-        if type(new) is not type(node[last]):
+        if type(new) is not type(node[last]) or (isinstance(new, float) and not math.isfinite(new)):
             raise UserError(f"--set {item}: wants a value like {node[last]}")
         node[last] = new
     least = {("train", "steps"): 1, ("train", "batch"): 1, ("train", "patience"): 0, ("objective", "lead"): 0}
@@ -118,9 +119,11 @@ def file_hash(path: Path | str) -> str:
 def code_version() -> str:
     """The package's, and where git knows it the commit, "-dirty" if files differ from it."""
     try:
-        command = ["git", "-C", str(paths.ROOT), "describe", "--always", "--dirty", "--abbrev=12"]
+        command = ["git", "-C", str(paths.ROOT), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
         done = subprocess.run(command, capture_output=True, text=True, timeout=20)
     except (OSError, subprocess.TimeoutExpired):
+        return __version__
+    if not (paths.ROOT / ".git").exists():  # that of a repository around ours
         return __version__
     return f"{__version__} {done.stdout.strip()}".strip()
 
@@ -194,6 +197,7 @@ class Trainer:
         self, config: dict, data: Path | str, run: Path | str, seed: int, device: str, replays: Path | str | None = None
     ):
         self.rank, self.world, device = join_others(device)
+        config = copy.deepcopy(config)
         if config["train"]["batch"] < self.world:
             raise UserError(f"train.batch is {config['train']['batch']}: fewer windows than processes ({self.world})")
         self.config, self.data, self.run, self.seed, self.device = config, Path(data), Path(run), seed, device
@@ -207,6 +211,8 @@ class Trainer:
         replayed = [d for d in replayed if d.attrs.get("source") in train_names]
         if self.replays and not replayed:
             raise UserError(f"{replays}: holds no replays of the demonstrations that {data} trains on")
+        if not any(d.object_valid.any() or d.arrays().environment.size for d in train_demos):
+            raise UserError(f"{data}: no demonstration shows an object; there is no interaction to learn")
         space = load_space(train_demos, config["model"]["objects"], config["model"]["rotation"])
         space.fit([state_of(d) for d in train_demos + replayed])
         recorded = prepare(train_demos, space, train_names)
@@ -499,8 +505,9 @@ class Trainer:
         if log:
             log.close()
             if patience and valid:
-                result["best_step"] = self.best[1]
-                os.replace(self.run / "best.pt", self.path)
+                result["best_step"], result["best_loss"] = self.best[1], self.best[0]
+                if (self.run / "best.pt").exists():  # not where a run that had ended went on and became no better
+                    os.replace(self.run / "best.pt", self.path)
             (self.run / RESULT).write_text(json.dumps(result, indent=1))
         return result
 
@@ -552,7 +559,7 @@ class Trainer:
         if not self.path.exists():
             raise UserError(f"{self.path}: nothing to resume; train without --resume first")
         c = load_checkpoint(self.run)
-        if c["config"]["model"] != self.config["model"]:
+        if {"latent": [LATENT, LATENT]} | c["config"]["model"] != self.config["model"]:
             raise UserError(f"{self.path}: was trained with another model configuration")
         if c["config"]["objective"].get("cuts", "motion") != self.cuts.kind:
             raise UserError(f"{self.path}: was trained with other objective.cuts")
@@ -569,6 +576,8 @@ class Trainer:
         self.scheduler.load_state_dict(c["scheduler"])
         self.rng.bit_generator.state = json.loads(c["rng"])
         self.step, self.seconds, self.best = c["step"], c["seconds"], c["best"]
+        if c["code_version"] != self.code_version:
+            self.code_version = f"{c['code_version']}, then {self.code_version}"
 
 
 def load_checkpoint(run: Path | str) -> dict:
