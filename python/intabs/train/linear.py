@@ -29,8 +29,8 @@ QUIET = 0.1  # of the initial weights that the LSTMs' outputs keep
 
 @dataclass
 class Motion:
-    """Of M skills. The displacement's course in the units of RolloutError, POINTS of each; of the Lite 6's objects along
-    the tip's axes, though the ranges are those along the axes of W."""
+    """Of M skills. The displacement's course in the units of RolloutError, POINTS of each; of the Lite 6's objects
+    along the tip's axes, though the ranges are those along the axes of W."""
 
     pooled: dict[str, Tensor]  # of agent and environment, what an encoder's linear path pools: (M, BASIS, n)
     coefficients: dict[str, Tensor]  # of what pi's heads are to say: (M, BASIS, n)
