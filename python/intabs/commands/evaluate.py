@@ -39,7 +39,7 @@ def register(app: typer.Typer) -> None:
             import torch  # noqa: F401
         except ImportError:
             raise UserError("torch is not installed: run tools/setup (without --runtime-only)") from None
-        from intabs.evaluate.evaluate import FIGURES, FROM_TIP
+        from intabs.evaluate.evaluate import FIGURES, FROM_TIP, with_interval
         from intabs.evaluate.evaluate import evaluate as run
 
         if confusion and confusion.suffix != ".png":
@@ -67,7 +67,7 @@ def register(app: typer.Typer) -> None:
                 shown = ("all_from_tip", None, None, "position_from_tip", "orientation_from_tip")
                 print(f"{name:14}" + "".join(f"{f[k]:13.4f}" if k else " " * 13 for k in shown))
         for name, f in figures["ratios"].items():
-            text = "".join(f"  {k} {f[k][0]:.2f} ({f[k][1]:.2f}-{f[k][2]:.2f})" for k in FIGURES)
+            text = "".join(f"  {k} {with_interval(f[k])}" for k in FIGURES)
             print(f"{next(iter(figures['methods']))} / {name}:{text}")
         if u := figures.get("usage"):
             active = " and ".join(f"{a} of {n}" for a, n in zip(u["active"], u["of"], strict=True))

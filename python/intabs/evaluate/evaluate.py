@@ -76,7 +76,7 @@ def evaluate(
     means over held-out demonstrations, or over all their segments; sd over seeds, of `all`; for the Lite 6 also
     FROM_TIP.
     ratios: of the first method's figures to the others', with 95 % intervals (bootstrap over held-out demonstrations,
-    paired; nan of a single one). usage and boundaries are the first seed's.
+    paired; None of a single one). usage and boundaries are the first seed's.
     """
     from intabs.train.trainer import file_hash
 
@@ -175,6 +175,12 @@ def ratios(rows: dict[str, list[list[dict]]], demo: list[int], draws: int = 2000
         for k in FIGURES:
             a, b = values[first][k], values[name][k]
             drawn = [a[p].mean() / max(b[p].mean(), 1e-12) for p in picks]
-            low, high = np.quantile(drawn, [0.025, 0.975]) if len(groups) > 1 else (np.nan, np.nan)
-            out[name][k] = [float(a.mean() / max(b.mean(), 1e-12)), float(low), float(high)]
+            interval = np.quantile(drawn, [0.025, 0.975]).tolist() if len(groups) > 1 else [None, None]
+            out[name][k] = [float(a.mean() / max(b.mean(), 1e-12)), *interval]
     return out
+
+
+def with_interval(figure: list) -> str:
+    """Of `ratios`: "0.92 (0.86-0.96)"."""
+    ratio, low, high = figure
+    return f"{ratio:.2f}" + ("" if low is None else f" ({low:.2f}-{high:.2f})")

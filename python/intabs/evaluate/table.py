@@ -14,7 +14,7 @@ from intabs import paths
 from intabs.data import edit, importers
 from intabs.data.reader import DemoFile
 from intabs.errors import UserError
-from intabs.evaluate.evaluate import evaluate
+from intabs.evaluate.evaluate import evaluate, with_interval
 from intabs.output import Progress, write_json
 
 CONFIGS = {"intabs": "intabs-small", "tvi": "tvi", "tvi-agent": "tvi-agent"}
@@ -113,10 +113,7 @@ def text(results: dict) -> str:
                 f"{both(f, 'orientation')} | {whole['all']:.3f} |"
             )
         for other, k in r["segment"]["ratios"].items():
-            said = ", ".join(
-                f"{n} {k[n][0]:.2f} ({k[n][1]:.2f}-{k[n][2]:.2f})"
-                for n in ("all", "balanced", "position", "orientation")
-            )
+            said = ", ".join(f"{n} {with_interval(k[n])}" for n in ("all", "balanced", "position", "orientation"))
             lines.append(f"- intabs / {other}, segment: {said}")
         if name in THESIS:
             what, hdmp, tvi, ours = THESIS[name]
