@@ -41,13 +41,13 @@ def register(app: typer.Typer) -> None:
             import torch
         except ImportError:
             raise UserError("torch is not installed: run tools/setup (without --runtime-only)") from None
-        from intabs.train.trainer import Trainer, end_together, load_checkpoint, load_config
+        from intabs.train.trainer import Trainer, end_together, load_checkpoint, load_config, sizes_of
 
         if device is Device.cuda and not torch.cuda.is_available():
             raise UserError("--device cuda: torch sees no GPU here; leave it out")
         settings = load_config(config, set_ or [])
         if resume and settings["model"]["latent"] == [0, 0]:  # as they were found when it began
-            settings["model"]["latent"] = load_checkpoint(out)["config"]["model"].get("latent", [0, 0])
+            settings["model"]["latent"] = sizes_of(load_checkpoint(out))
         elif not resume and (out / "checkpoint.pt").exists():
             raise UserError(f"{out / 'checkpoint.pt'} is there already: add --resume, or give another --out")
         trainer = Trainer(settings, data, out, seed, device.value, replays)

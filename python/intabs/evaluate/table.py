@@ -32,11 +32,11 @@ PIECE, PIECES_HELD_OUT, HELD_OUT = 30, 0.25, 0.1  # frames of a piece; shares
 
 def check_same(config: str, data: Path, run: Path, settings: list[str]) -> None:
     """Raises UserError where a run that is there came from other settings or data."""
-    from intabs.train.trainer import file_hash, load_checkpoint, load_config
+    from intabs.train.trainer import file_hash, load_checkpoint, load_config, sizes_of
 
     there, want = load_checkpoint(run), load_config(config, settings)
     if want["model"]["latent"] == [0, 0]:
-        want["model"]["latent"] = there["config"]["model"].get("latent")
+        want["model"]["latent"] = sizes_of(there)
     what = "data" if there["data"]["sha256"] != file_hash(data) else "settings" if there["config"] != want else ""
     if what:
         raise UserError(f"{run}: was trained with other {what}; name another --runs, or remove it")

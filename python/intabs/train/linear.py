@@ -3,8 +3,9 @@ of encoders and pi, which hold the principal components of the skills' motion.
 
 A skill's steps r_t are described by coefficients C of the phase basis, r_t = sum_k b_k(t) C_k, a linear function of
 the encoder's mean input; z are the principal components of C; pi's linear path gives r_t back from z b_k(t). So the
-first rollout is as good as principal components, and what the LSTMs learn comes on top (figures: python/README.md).
-Of objects only what they do by themselves counts: what the tip carries goes with the tip (pi's head `carried`).
+first rollout is about as good as principal components; what the LSTMs learn comes on top (figures: python/README.md).
+Of objects only what they do by themselves counts: what the tip carries goes with the tip (pi's head `carried`), as soon
+as that is learned; in the first rollout nothing is held.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ class Motion:
 
 @torch.no_grad()
 def measure(space: Space, sampler: WindowSampler, error: RolloutError) -> Motion:
+    """Of windows drawn always alike, so that every seed has the same sizes. error: for the units."""
     rng = np.random.default_rng(0)
     pooled: dict[str, list[Tensor]] = {"agent": [], "environment": []}
     outputs: dict[str, list[Tensor]] = {"agent": [], "environment": [], "response": []}

@@ -559,7 +559,7 @@ class Trainer:
         if not self.path.exists():
             raise UserError(f"{self.path}: nothing to resume; train without --resume first")
         c = load_checkpoint(self.run)
-        if {"latent": [LATENT, LATENT]} | c["config"]["model"] != self.config["model"]:
+        if c["config"]["model"] | {"latent": sizes_of(c)} != self.config["model"]:
             raise UserError(f"{self.path}: was trained with another model configuration")
         if c["config"]["objective"].get("cuts", "motion") != self.cuts.kind:
             raise UserError(f"{self.path}: was trained with other objective.cuts")
@@ -576,7 +576,7 @@ class Trainer:
         self.scheduler.load_state_dict(c["scheduler"])
         self.rng.bit_generator.state = json.loads(c["rng"])
         self.step, self.seconds, self.best = c["step"], c["seconds"], c["best"]
-        if c["code_version"] != self.code_version:
+        if not c["code_version"].endswith(self.code_version):
             self.code_version = f"{c['code_version']}, then {self.code_version}"
 
 
@@ -585,6 +585,11 @@ def load_checkpoint(run: Path | str) -> dict:
     if not path.exists():
         raise UserError(f"{path}: no such checkpoint; `intabs train --out {run}` makes one")
     return torch.load(path, map_location="cpu", weights_only=True)
+
+
+def sizes_of(checkpoint: dict) -> list[int]:
+    """Numbers of z^r and z^e; checkpoints of before there was a choice do not say them."""
+    return checkpoint["config"]["model"].get("latent", [LATENT, LATENT])
 
 
 def load_model(run: Path | str) -> tuple[InteractionAbstractions, dict]:
